@@ -1,0 +1,317 @@
+"""Typed configuration: frozen dataclasses with the paper's lite figures as defaults, and strict loading from YAML.
+
+A file in ``configs/`` holds only what differs. An unknown key, a wrong type or a value out of range is an
+``InputError`` that names the key and suggests the nearest one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import re
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from .types import InputError
+
+MAX_CONFIG_BYTES = 64 * 1024
+
+
+def _number(default: Any, low: float = -math.inf, high: float = math.inf) -> Any:
+    """A field that must lie in [low, high]."""
+    return field(default=default, metadata={"low": low, "high": high})
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """The map: multi-resolution hash grid, one-blob encoding, two decoders (paper, section III-A)."""
+
+    levels: int = _number(16, 1, 32)
+    log2_table_size: int = _number(16, 8, 24)
+    base_resolution: int = _number(16, 2, 512)
+    finest_voxel_m: float = _number(0.02, 1e-3, 1.0)
+    blob_bins: int = _number(16, 4, 64)
+    beta: float = _number(10.0, 0.1, 1e3)
+    init_scale: float = _number(1e-4, 0.0, 1.0)
+    box: tuple[float, ...] | None = None
+    box_margin_m: float = _number(0.3, 0.0, 10.0)
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """Depths along a ray: ``uniform`` over the ray and ``near_depth`` within ``depth_range_m`` of the measured depth."""
+
+    uniform: int = _number(32, 0, 512)
+    near_depth: int = _number(11, 1, 512)
+    depth_range_m: float = _number(0.10, 1e-3, 1.0)
+    near_m: float = _number(0.05, 0.0, 10.0)
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the paper's losses (equations 4 to 7); feature and uniform rays are weighted apart."""
+
+    free_space: float = _number(5.0, 0.0)
+    centre: float = _number(200.0, 0.0)
+    tail: float = _number(10.0, 0.0)
+    depth_uniform: float = _number(0.1, 0.0)
+    depth_feature: float = _number(0.1, 0.0)
+    colour_uniform: float = _number(5.0, 0.0)
+    colour_feature: float = _number(5.0, 0.0)
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Pose of each frame against the fixed map."""
+
+    method: Literal["adam", "lm"] = "adam"
+    iterations: int = _number(8, 1, 500)
+    rays: int = _number(1000, 16, 200_000)
+    lr_rotation: float = _number(1e-3, 0.0, 1.0)
+    lr_translation: float = _number(1e-3, 0.0, 1.0)
+    loss: LossWeights = LossWeights(10.0, 200.0, 50.0, 1.0, 1.0, 5.0, 5.0)
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """Joint optimisation of the map and the poses in the window."""
+
+    every: int = _number(5, 1, 1000)
+    first_iterations: int = _number(200, 1, 100_000)
+    iterations: int = _number(10, 0, 10_000)
+    rays: int = _number(2000, 16, 1_000_000)
+    lr_grid: float = _number(1e-2, 0.0, 1.0)
+    lr_decoder: float = _number(1e-2, 0.0, 1.0)
+    lr_rotation: float = _number(1e-3, 0.0, 1.0)
+    lr_translation: float = _number(1e-3, 0.0, 1.0)
+    loss: LossWeights = LossWeights()
+    smooth_weight: float = _number(1e-6, 0.0)
+    smooth_points: int = _number(32, 2, 256)
+    smooth_voxel_m: float = _number(0.1, 1e-3, 1.0)
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """Which keyframes take part in bundle adjustment (paper, section III-B)."""
+
+    size: int = _number(30, 2, 1000)
+    max_angle_deg: float = _number(60.0, 1.0, 180.0)
+    recent: int = _number(5, 1, 100)
+    historic: int = _number(3, 0, 100)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything a run depends on besides the sequence. Defaults are the paper's lite preset on Replica."""
+
+    preset: str = "lite"
+    seed: int = _number(0, 0, 2**31 - 1)
+    schedule: Literal["strict", "overlap"] = "strict"
+    fus: bool = True
+    eba: bool = True
+    truncation_m: float = _number(0.06, 1e-3, 1.0)
+    centre_share: float = _number(0.4, 0.01, 1.0)
+    depth_near_m: float = _number(0.1, 0.0, 10.0)
+    depth_far_m: float = _number(8.0, 0.1, 100.0)
+    border_px: int = _number(20, 0, 200)
+    feature_count: int = _number(200, 0, 10_000)
+    feature_quality: float = _number(0.03, 1e-6, 1.0)
+    feature_distance_px: int = _number(5, 1, 100)
+    keyframe_every: int = _number(5, 1, 1000)
+    keyframe_share: float = _number(0.05, 1e-4, 1.0)
+    field: FieldConfig = FieldConfig()
+    sampling: SamplingConfig = SamplingConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    mapping: MappingConfig = MappingConfig()
+    window: WindowConfig = WindowConfig()
+
+
+# ---- loading ------------------------------------------------------------------------------------------------------
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML without aliases and duplicate keys, and with ``1e-3`` read as the number it looks like."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.events.AliasEvent):  # type: ignore[no-untyped-call]
+            raise yaml.YAMLError("aliases (*name) are not allowed")
+        return super().compose_node(parent, index)  # type: ignore[arg-type]
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
+            if key in seen:
+                raise yaml.YAMLError(f"the key {key!r} stands twice (line {key_node.start_mark.line + 1})")
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
+    list("-+0123456789."),
+)
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """Parse strict YAML. Raises InputError naming ``source``."""
+    if len(text) > MAX_CONFIG_BYTES:
+        raise InputError(f"{source}: over {MAX_CONFIG_BYTES // 1024} KiB, which no configuration needs; is it the right file?")
+    try:
+        return yaml.load(text, _StrictLoader)
+    except yaml.YAMLError as error:
+        raise InputError(f"{source}: not valid YAML: {' '.join(str(error).split())}") from None
+
+
+def config_folder() -> Path:
+    """Where the presets lie: beside the package in a checkout, inside it when installed from a wheel."""
+    inside = Path(__file__).parent / "configs"
+    return inside if inside.is_dir() else Path(__file__).parent.parent / "configs"
+
+
+def preset_names() -> list[str]:
+    """Names that ``--preset`` takes."""
+    return sorted(p.stem for p in config_folder().glob("*.yaml"))
+
+
+def load_preset(name: str) -> Config:
+    """The named preset. Raises InputError with the nearest name when there is none."""
+    path = config_folder() / f"{name}.yaml"
+    if not re.fullmatch(r"[\w-]+", name) or not path.is_file():
+        raise InputError(f"preset {name!r}: no such preset{_suggest(name, preset_names())}; there are: {', '.join(preset_names())}")
+    return apply(Config(preset=name), parse_yaml(path.read_text("utf-8"), str(path)) or {}, str(path))
+
+
+def load_config(path: Path, base: Config | None = None) -> Config:
+    """Read a YAML file over ``base`` (default: the preset it names, else lite). Raises InputError."""
+    try:
+        values = parse_yaml(path.read_text("utf-8"), str(path)) or {}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give --config an existing YAML file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; give --config a YAML file") from None
+    if base is None:
+        named = values.get("preset", "lite") if isinstance(values, dict) else "lite"
+        base = load_preset(str(named))
+    return apply(base, values, str(path))
+
+
+def apply_settings(config: Config, settings: list[str]) -> Config:
+    """Apply ``key=value`` strings with dotted keys, e.g. ``mapping.iterations=20``. Raises InputError."""
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set {setting}: write it as key=value, e.g. --set mapping.iterations=20")
+        value = parse_yaml(text, f"--set {key}")
+        nested: Any = value
+        for part in reversed(key.strip().split(".")):
+            nested = {part: nested}
+        config = apply(config, nested, "--set")
+    return config
+
+
+def apply(config: Config, values: Mapping[str, Any], source: str) -> Config:
+    """A copy of ``config`` with ``values`` (nested mappings) laid over it. Raises InputError."""
+    result = _apply(config, values, source, "")
+    if result.depth_near_m >= result.depth_far_m:
+        raise InputError(f"{source}: depth_near_m must be smaller than depth_far_m")
+    if result.field.box is not None and len(result.field.box) != 6:
+        raise InputError(f"{source}: field.box takes six numbers: x_min, y_min, z_min, x_max, y_max, z_max (metres)")
+    return result
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Nested plain dictionaries, ready for YAML or JSON."""
+    out: dict[str, Any] = {}
+    for f in fields(config):
+        value = getattr(config, f.name)
+        out[f.name] = to_dict(value) if is_dataclass(value) else list(value) if isinstance(value, tuple) else value
+    return out
+
+
+def to_yaml(config: Config) -> str:
+    """The resolved configuration as YAML that ``load_config`` reads back to an equal object."""
+    return yaml.safe_dump(to_dict(config), sort_keys=False)
+
+
+def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
+    if not isinstance(values, Mapping):
+        raise InputError(f"{source}: {prefix.rstrip('.') or 'the file'} must hold keys and values, not {_kind(values)}")
+    hints = typing.get_type_hints(type(node))
+    by_name = {f.name: f for f in fields(node)}
+    changes: dict[str, Any] = {}
+    for key, value in values.items():
+        path = f"{prefix}{key}"
+        if key not in by_name:
+            raise InputError(f"{source}: unknown key {path!r}{_suggest(path, _all_keys(Config))}")
+        current = getattr(node, key)
+        if is_dataclass(current):
+            changes[key] = _apply(current, value, source, f"{path}.")
+        else:
+            changes[key] = _convert(value, hints[key], by_name[key].metadata, source, path)
+    return dataclasses.replace(node, **changes)
+
+
+def _convert(value: Any, hint: Any, limits: Mapping[str, Any], source: str, path: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (types.UnionType, typing.Union):
+        if value is None:
+            return None
+        hint = next(a for a in typing.get_args(hint) if a is not type(None))
+        origin = typing.get_origin(hint)
+    if origin is Literal:
+        options = typing.get_args(hint)
+        if value not in options:
+            raise InputError(f"{source}: {path} must be one of {', '.join(map(str, options))}, not {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)) or not all(_is_number(v) for v in value):
+            raise InputError(f"{source}: {path} must be a list of numbers, not {_kind(value)}")
+        return tuple(float(v) for v in value)
+    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}[hint]
+    ok = {
+        int: isinstance(value, int) and not isinstance(value, bool),
+        float: _is_number(value),
+        bool: isinstance(value, bool),
+        str: isinstance(value, str),
+    }[hint]
+    if not ok:
+        raise InputError(f"{source}: {path} must be {wanted}, not {_kind(value)} {value!r}")
+    low, high = limits.get("low", -math.inf), limits.get("high", math.inf)
+    if hint in (int, float) and not low <= value <= high:
+        raise InputError(f"{source}: {path} = {value} is out of range; it must lie in {low:g} .. {high:g}")
+    return float(value) if hint is float else value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _kind(value: Any) -> str:
+    names = {dict: "a group of keys", list: "a list", str: "text", bool: "true/false", type(None): "nothing"}
+    return names.get(type(value), "the number" if isinstance(value, (int, float)) else type(value).__name__)
+
+
+def _all_keys(node: type, prefix: str = "") -> list[str]:
+    keys: list[str] = []
+    hints = typing.get_type_hints(node)
+    for f in fields(node):
+        keys.append(prefix + f.name)
+        if is_dataclass(hints[f.name]):
+            keys += _all_keys(hints[f.name], f"{prefix}{f.name}.")
+    return keys
+
+
+def _suggest(word: str, options: list[str]) -> str:
+    near = difflib.get_close_matches(word, options, 1, 0.6)
+    if not near:
+        near = [o for o in options if o.rsplit(".", 1)[-1] == word.rsplit(".", 1)[-1]][:1]
+    return f"; did you mean {near[0]!r}?" if near else ""

@@ -1,0 +1,132 @@
+"""The values that cross the kernel seam. Plain tensors and numbers: no random state, no configuration, no globals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+HIDDEN = 32
+FEATURES = 2
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """Where each level of the hash grid lies; all tensors on the CPU.
+
+    Lattice points of level l sit at ``anchor + k * voxel[l]`` (metres, k integer), so a cell's place never depends on
+    the scene box and the box can grow. A dense level stores ``dims[l]`` lattice points from ``first[l]`` on, row-major
+    with x fastest; a hashed level has dims 0 and maps k to ``hash(k) mod size[l]`` (size a power of two), with the
+    spatial hash of Mueller et al. 2022: (kx * 1) xor (ky * 2654435761) xor (kz * 805459861) in wrapping uint32.
+
+    offset, size: int64 [L], in table rows. voxel: float32 [L], metres. first, dims: int64 [L, 3]. anchor: float32 [3].
+    blob_low, blob_size: float32 [3], metres: one period of the one-blob encoding (tiny-cuda-nn's quartic kernel, which
+    wraps around). box: float32 [2, 3]; points outside are clamped onto it and get no position gradient on that axis.
+    """
+
+    offset: Tensor
+    size: Tensor
+    voxel: Tensor
+    first: Tensor
+    dims: Tensor
+    anchor: Tensor
+    blob_low: Tensor
+    blob_size: Tensor
+    box: Tensor
+    bins: int
+
+    @property
+    def levels(self) -> int:
+        """Number of levels L."""
+        return int(self.offset.numel())
+
+    @property
+    def inputs(self) -> int:
+        """Width of the encoding: [hash features (2 per level), one-blob x, y, z]."""
+        return FEATURES * self.levels + 3 * self.bins
+
+
+@dataclass(frozen=True)
+class FieldParams:
+    """The learnt numbers. table: [rows, 2]; w_in: [inputs, 64] (columns 0..31 feed the TSDF decoder, 32..63 the colour
+    decoder); w_sdf: [32, 1]; w_rgb: [32, 3]; beta: [1]. float32 (the reference also takes float64)."""
+
+    table: Tensor
+    w_in: Tensor
+    w_sdf: Tensor
+    w_rgb: Tensor
+    beta: Tensor
+
+
+@dataclass(frozen=True)
+class RayBatch:
+    """Rays to render, in camera coordinates, so that an iteration only transforms them.
+
+    direction: [R, 3] with z = 1 (a point at depth z is z * direction). z: [R, S] sample depths, ascending, metres.
+    depth: [R] measured depth, 0 = none. color: [R, 3] in 0..1. feature: bool [R], True for rays at feature points.
+    pose: int64 [R], row of the pose table each ray belongs to, ASCENDING (rays of one pose are contiguous).
+    """
+
+    direction: Tensor
+    z: Tensor
+    depth: Tensor
+    color: Tensor
+    feature: Tensor
+    pose: Tensor
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Loss weights and the two lengths the losses need (metres). Paper, equations 4 to 7."""
+
+    free_space: float
+    centre: float
+    tail: float
+    depth_uniform: float
+    depth_feature: float
+    colour_uniform: float
+    colour_feature: float
+    truncation_m: float
+    centre_share: float
+
+
+LOSS_NAMES = ("free_space", "centre", "tail", "depth", "colour")
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """losses: [5] weighted terms in the order of LOSS_NAMES (their sum is the objective). d_c2w: [P, 3, 4], with
+    respect to the upper rows of the pose matrices, None unless asked for."""
+
+    losses: Tensor
+    d_c2w: Tensor | None
+
+
+@dataclass(frozen=True)
+class AlignSettings:
+    """What the direct alignment of points to the TSDF needs.
+
+    truncation_m: metres per TSDF unit. kernel_m, colour_kernel: scales of the Geman-McClure weights (metres; luminance
+    0..1). tsdf_limit: points with |TSDF| above it are dropped. gradient_low, gradient_high: points whose metric gradient
+    norm (1 for a distance) lies outside are dropped. colour_weight: metres per unit of luminance, 0 = geometry alone.
+    """
+
+    truncation_m: float
+    kernel_m: float
+    tsdf_limit: float
+    gradient_low: float
+    gradient_high: float
+    colour_weight: float
+    colour_kernel: float
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Gauss-Newton sums over points, in the tangent of ``se3.retract``. jtj: float64 [6, 6]; jtr: float64 [6]; cost:
+    robust objective (sum over used points); used: points that took part; inliers: those with weight above one half."""
+
+    jtj: Tensor
+    jtr: Tensor
+    cost: float
+    used: int
+    inliers: int

@@ -1,0 +1,95 @@
+"""Which pixels of an image become rays: features and a jittered uniform grid (FUS), or uniform random (the ablation).
+
+Sampled once per frame, in the camera's coordinates (paper, section III-B, "Robust Pixel Sampling Method").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import Config
+from .types import Frame, Intrinsics
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Chosen pixels of one frame, compact enough to keep: 20 bytes each.
+
+    direction: float32 [N, 2], the x and y of the viewing ray at unit depth. depth: float32 [N] metres, 0 = none.
+    color: uint8 [N, 3]. feature: bool [N].
+    """
+
+    direction: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    color: NDArray[np.uint8]
+    feature: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+    def points(self) -> NDArray[np.float32]:
+        """Measured surface points [M, 3] in camera coordinates, of the pixels with depth."""
+        has = self.depth > 0
+        z = self.depth[has, None]
+        return np.concatenate([self.direction[has] * z, z], 1)
+
+    def take(self, index: NDArray[np.integer]) -> Pixels:
+        """The pixels at ``index``."""
+        return Pixels(self.direction[index], self.depth[index], self.color[index], self.feature[index])
+
+
+def feature_points(color: NDArray[np.uint8], config: Config, limit: int) -> NDArray[np.int64]:
+    """Flat indices of at most ``limit`` Shi-Tomasi corners of an RGB image [H, W, 3], strongest first."""
+    height, width = color.shape[:2]
+    border = _border(config, height, width)
+    count = min(limit, config.feature_count)
+    if count <= 0:
+        return np.empty(0, np.int64)
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[border : height - border, border : width - border]
+    corners = cv2.goodFeaturesToTrack(gray, count, config.feature_quality, config.feature_distance_px)
+    if corners is None:
+        return np.empty(0, np.int64)
+    u, v = np.rint(corners.reshape(-1, 2)).astype(np.int64).T + border
+    return v * width + u
+
+
+def grid_points(height: int, width: int, border: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Flat indices of exactly ``count`` pixels, one in each cell of a uniform grid, jittered inside its cell."""
+    h, w = height - 2 * border, width - 2 * border
+    rows = max(1, int(np.ceil(np.sqrt(count * h / w))))
+    columns = max(1, int(np.ceil(count / rows)))
+    cell = np.arange(rows * columns)
+    if len(cell) > count:
+        cell = np.sort(rng.choice(cell, count, replace=False))
+    jitter = rng.random((2, len(cell)))
+    v = ((cell // columns + jitter[0]) * (h / rows)).astype(np.int64)
+    u = ((cell % columns + jitter[1]) * (w / columns)).astype(np.int64)
+    return (np.minimum(v, h - 1) + border) * width + np.minimum(u, w - 1) + border
+
+
+def choose_pixels(frame: Frame, camera: Intrinsics, count: int, config: Config, rng: np.random.Generator) -> Pixels:
+    """``count`` pixels of a frame. With FUS: its features, the rest from the grid; without: uniform random."""
+    height, width = frame.depth.shape
+    border = _border(config, height, width)
+    if config.fus:
+        corners = feature_points(frame.color, config, count // 2)
+        rest = grid_points(height, width, border, count - len(corners), rng)
+        index = np.concatenate([corners, rest])
+        feature = np.arange(len(index)) < len(corners)
+    else:
+        v = rng.integers(border, height - border, count)
+        u = rng.integers(border, width - border, count)
+        index, feature = v * width + u, np.zeros(count, bool)
+    v, u = np.divmod(index, width)
+    direction = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], 1).astype(np.float32)
+    depth = frame.depth.reshape(-1)[index]
+    depth = np.where((depth >= config.depth_near_m) & (depth <= config.depth_far_m), depth, np.float32(0))
+    return Pixels(direction, depth, frame.color.reshape(-1, 3)[index], feature)
+
+
+def _border(config: Config, height: int, width: int) -> int:
+    return min(config.border_px, (min(height, width) - 1) // 4)

@@ -1,0 +1,118 @@
+"""The nouns of the project: frozen value types, with shapes and units in the docstrings. Imports numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.floating]
+
+
+class InputError(Exception):
+    """Something the user gave cannot be used. The message is one line: what is wrong, where, and what to do.
+
+    The command line prints it without a traceback and exits with code 2.
+    """
+
+
+class FrameError(InputError):
+    """One frame cannot be read (missing, truncated, wrong size ...). A run skips the frame and counts it."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera, OpenCV convention (x right, y down, z forward); all values in pixels.
+
+    ``distortion`` holds OpenCV's (k1, k2, p1, p2[, k3]) and is empty for an ideal pinhole. A ``Sequence`` returns
+    images that are already undistorted, so the engine never looks at it.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+
+    def matrix(self) -> NDArray[np.float64]:
+        """The 3x3 calibration matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """The same camera at another image size (pixel centres at integer coordinates)."""
+        sx, sy = width / self.width, height / self.height
+        return Intrinsics(
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            width,
+            height,
+            self.distortion,
+        )
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One RGB-D image.
+
+    index: position in the sequence. timestamp: seconds. color: uint8 [H, W, 3], RGB. depth: float32 [H, W], metres
+    along the optical axis, exactly 0 where there is none (never NaN or Inf). c2w_gt: float64 [4, 4] camera-to-world
+    ground truth in metres, or None.
+    """
+
+    index: int
+    timestamp: float
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    c2w_gt: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh. vertices: float32 [V, 3] metres; faces: int32 [F, 3]; colors: uint8 [V, 3] RGB or None."""
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    colors: NDArray[np.uint8] | None = None
+
+
+@runtime_checkable
+class Sequence(Protocol):
+    """What a data set looks like to the engine. Indexing reads from disk; everything else is cheap.
+
+    name: shown to people, e.g. ``7scenes-redkitchen``. layout: ``7scenes``, ``tum``, ``replica``, ``vmap``,
+    ``scannet`` or ``synthetic``. preset: the preset that suits this layout when the user names none. bounds: float64
+    [2, 3] scene box in metres in the frame of the ground truth, or None when unknown.
+    """
+
+    name: str
+    layout: str
+    preset: str
+    intrinsics: Intrinsics
+    bounds: NDArray[np.float64] | None
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Frame:
+        """Read frame ``index`` (0 <= index < len). Raises ``FrameError`` when it cannot be read."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+    def timestamps(self) -> NDArray[np.float64]:
+        """[N] seconds, one per frame, without reading images."""
+        ...
+
+    def poses_gt(self) -> NDArray[np.float64] | None:
+        """[N, 4, 4] camera-to-world, NaN-filled where a frame has none; None when the sequence has no ground truth."""
+        ...
+
+    def reference_mesh(self) -> Mesh | None:
+        """The ground-truth surface, for evaluation only; None where there is none."""
+        ...
