@@ -37,7 +37,7 @@ class LoopEvent:
     frame: where it happened. keyframes: frame indices of the old keyframes involved. correction_cm, correction_deg:
     how far the joint optimisation moved the current pose. loss_before, loss_after: weighted mapping loss.
     error_before_cm, error_after_cm, rotation_error_before_deg, rotation_error_after_deg: against ground truth, None
-    without it. trajectory_before: float32 [N, 3] camera centres of all frames so far, before the correction.
+    without it. trajectory_before: float32 [N, 3] camera centres of all frames so far, before the correction. c2w_before: float64 [4, 4] current pose before it.
     """
 
     frame: int
@@ -51,6 +51,7 @@ class LoopEvent:
     rotation_error_before_deg: float | None
     rotation_error_after_deg: float | None
     trajectory_before: NDArray[np.float32]
+    c2w_before: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -143,10 +144,11 @@ class MeshReady:
 
 @dataclass(frozen=True)
 class Exported:
-    """A file was written. kind: ``mesh``, ``trajectory``, ...; path: where it lies."""
+    """A file was written. kind: ``mesh``, ``trajectory``, ...; path: where it lies; command_id: who asked for it."""
 
     kind: str
     path: str
+    command_id: int | None = None
 
 
 @dataclass(frozen=True)
@@ -184,6 +186,11 @@ class RunTo:
     """Go on until ``frame`` is done, then pause."""
 
     frame: int
+
+
+@dataclass(frozen=True)
+class Stop:
+    """End the run here as if the sequence ended: save everything, state FINISHED. ``Restart`` begins again."""
 
 
 @dataclass(frozen=True)
@@ -262,6 +269,7 @@ Command = (
     | Resume
     | Step
     | RunTo
+    | Stop
     | Restart
     | LoadPreset
     | Tune
