@@ -46,7 +46,7 @@ class FieldConfig:
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """Depths along a ray: ``uniform`` over the ray and ``near_depth`` within ``depth_range_m`` of the measured depth."""
+    """Depths along a ray: ``uniform`` over it and ``near_depth`` within ``depth_range_m`` of the measured depth."""
 
     uniform: int = _number(32, 0, 512)
     near_depth: int = _number(11, 1, 512)
@@ -69,13 +69,22 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Pose of each frame against the fixed map."""
+    """Pose of each frame against the fixed map.
+
+    ``adam`` is the paper's: the learning rates and loss weights. ``lm`` is ours: the fields from kernels_m to
+    colour_kernel, see ``AlignSettings``.
+    """
 
     method: Literal["adam", "lm"] = "adam"
     iterations: int = _number(8, 1, 500)
     rays: int = _number(1000, 16, 200_000)
     lr_rotation: float = _number(1e-3, 0.0, 1.0)
     lr_translation: float = _number(1e-3, 0.0, 1.0)
+    kernels_m: tuple[float, ...] = (0.06, 0.02)
+    tsdf_limit: float = _number(1.2, 0.1, 10.0)
+    gradient_range: tuple[float, ...] = (0.3, 2.0)
+    colour_weight_m: float = _number(0.02, 0.0, 1.0)
+    colour_kernel: float = _number(0.2, 1e-3, 10.0)
     loss: LossWeights = LossWeights(10.0, 200.0, 50.0, 1.0, 1.0, 5.0, 5.0)
 
 
@@ -164,7 +173,9 @@ _StrictLoader.add_implicit_resolver(
 def parse_yaml(text: str, source: str) -> Any:
     """Parse strict YAML. Raises InputError naming ``source``."""
     if len(text) > MAX_CONFIG_BYTES:
-        raise InputError(f"{source}: over {MAX_CONFIG_BYTES // 1024} KiB, which no configuration needs; is it the right file?")
+        raise InputError(
+            f"{source}: over {MAX_CONFIG_BYTES // 1024} KiB, which no configuration needs; is it the right file?"
+        )
     try:
         return yaml.load(text, _StrictLoader)
     except yaml.YAMLError as error:
@@ -186,7 +197,9 @@ def load_preset(name: str) -> Config:
     """The named preset. Raises InputError with the nearest name when there is none."""
     path = config_folder() / f"{name}.yaml"
     if not re.fullmatch(r"[\w-]+", name) or not path.is_file():
-        raise InputError(f"preset {name!r}: no such preset{_suggest(name, preset_names())}; there are: {', '.join(preset_names())}")
+        raise InputError(
+            f"preset {name!r}: no such preset{_suggest(name, preset_names())}; there are: {', '.join(preset_names())}"
+        )
     return apply(Config(preset=name), parse_yaml(path.read_text("utf-8"), str(path)) or {}, str(path))
 
 

@@ -37,7 +37,8 @@ class LoopEvent:
     frame: where it happened. keyframes: frame indices of the old keyframes involved. correction_cm, correction_deg:
     how far the joint optimisation moved the current pose. loss_before, loss_after: weighted mapping loss.
     error_before_cm, error_after_cm, rotation_error_before_deg, rotation_error_after_deg: against ground truth, None
-    without it. trajectory_before: float32 [N, 3] camera centres of all frames so far, before the correction. c2w_before: float64 [4, 4] current pose before it.
+    without it. trajectory_before: float32 [N, 3] camera centres of all frames so far, before the correction.
+    c2w_before: float64 [4, 4], the current pose before it.
     """
 
     frame: int

@@ -11,7 +11,7 @@ from .kernels import Backend, RayBatch
 
 
 def ray_exit(origin: Tensor, direction: Tensor, box: Tensor, limit: float) -> Tensor:
-    """Depth [R] at which rays (origin [R, 3], world direction [R, 3] at unit depth) leave the box, at most ``limit``."""
+    """Depth [R], at most ``limit``, at which rays (origin, world direction at unit depth: [R, 3]) leave the box."""
     safe = torch.where(direction.abs() < 1e-9, torch.full_like(direction, 1e-9), direction)
     last = torch.maximum((box[0] - origin) / safe, (box[1] - origin) / safe).amin(-1)
     return last.clamp(0.2, limit)

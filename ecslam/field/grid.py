@@ -70,7 +70,7 @@ def grow_layout(layout: GridLayout, box: NDArray[np.float64]) -> GridLayout:
 
 
 def regrow(old: GridLayout, new: GridLayout, rows: Tensor, fill: Tensor | None = None) -> Tensor:
-    """Carry per-row data [rows, C] of the old layout over to the new one; new rows come from ``fill`` (default zero)."""
+    """Carry per-row data [rows, C] of the old layout over to the new one; new rows come from ``fill`` (or are zero)."""
     total = int(new.size.sum())
     out = torch.zeros(total, rows.shape[1], dtype=rows.dtype, device=rows.device) if fill is None else fill.clone()
     for level in range(old.levels):

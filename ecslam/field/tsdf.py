@@ -43,7 +43,7 @@ def map_params(params: FieldParams, function: object) -> FieldParams:
 
 
 def create_field(config: FieldConfig, box: NDArray[np.float64], seed: int, device: torch.device) -> TsdfField:
-    """A fresh map over a scene box [2, 3] metres: features uniform within ``init_scale``, decoders as torch's Linear."""
+    """A fresh map over a scene box [2, 3] metres: features within ``init_scale``, decoders as torch's Linear."""
     layout = build_layout(config, box)
     generator = torch.Generator().manual_seed(seed)
 

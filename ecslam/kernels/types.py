@@ -107,8 +107,8 @@ class AlignSettings:
     """What the direct alignment of points to the TSDF needs.
 
     truncation_m: metres per TSDF unit. kernel_m, colour_kernel: scales of the Geman-McClure weights (metres; luminance
-    0..1). tsdf_limit: points with |TSDF| above it are dropped. gradient_low, gradient_high: points whose metric gradient
-    norm (1 for a distance) lies outside are dropped. colour_weight: metres per unit of luminance, 0 = geometry alone.
+    0..1). tsdf_limit: points with |TSDF| above it are dropped. gradient_low, gradient_high: points whose metric
+    gradient norm (1 for a distance) lies outside are dropped. colour_weight: metres per luminance (0: geometry only).
     """
 
     truncation_m: float

@@ -1,0 +1,61 @@
+"""Lost and found: notice within a few frames that the map no longer explains the images, and find the way back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .se3 import rotation_angle_deg
+from .tracker import TrackResult
+
+LOST_FIT = 0.25
+FOUND_FIT = 0.6
+PATIENCE = 3
+MAX_STEP_M = 0.5
+MAX_TURN_DEG = 35.0
+
+
+class Recovery:
+    """Judges every tracked pose. ``missed``: this frame's pose is only predicted. ``lost``: several in a row were; no
+    mapping until a keyframe is recognised again."""
+
+    def __init__(self) -> None:
+        self.lost, self.missed, self.note = False, False, ""
+        self._misses = 0
+
+    def judge(
+        self, track: TrackResult, last: NDArray[np.float64], relocalise: Callable[[], TrackResult | None]
+    ) -> TrackResult:
+        """The result to use for this frame, given the previous pose [4, 4]; ``relocalise`` is asked only in need."""
+        self.note = ""
+        trusted = not self.lost and self._plausible(track, last)
+        if not trusted:
+            found = relocalise()
+            if found is not None and found.fit >= FOUND_FIT:
+                self.note = "relocalised" if self.lost else "recovered"
+                track, trusted = found, True
+        if trusted:
+            self.lost, self.missed, self._misses = False, False, 0
+            return track
+        self._misses += 1
+        self.missed = True
+        self.lost = self.lost or self._misses >= PATIENCE
+        self.note = "lost: the map does not explain this frame" if self.lost else "not tracked, pose held"
+        return replace(track, c2w=last)
+
+    @staticmethod
+    def _plausible(track: TrackResult, last: NDArray[np.float64]) -> bool:
+        if not np.isfinite(track.c2w).all() or track.fit < LOST_FIT:
+            return False
+        step = float(np.linalg.norm(track.c2w[:3, 3] - last[:3, 3]))
+        return step < MAX_STEP_M and float(rotation_angle_deg(last, track.c2w)) < MAX_TURN_DEG
+
+
+def best_start(
+    track: Callable[[NDArray[np.float64]], TrackResult], starts: Iterable[NDArray[np.float64]]
+) -> TrackResult:
+    """Track from every start pose [4, 4] and keep the result that the map explains best."""
+    return max((track(start) for start in starts), key=lambda result: result.fit)

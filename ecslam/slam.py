@@ -1,0 +1,284 @@
+"""EC-SLAM on one screen: ``Slam.step`` takes a frame through the whole method.
+
+Synchronous at heart. In the ``strict`` schedule mapping runs inline (deterministic on a CPU); in ``overlap`` the same
+function runs on a second thread, as in the paper, and its result is applied between frames.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from . import kernels as seam
+from .config import Config
+from .field import TsdfField, box_of_points, create_field
+from .keyframes import Keyframe, make_thumbnail, most_similar
+from .loops import LoopDetector
+from .mapper import Mapper, MapResult
+from .messages import LoopEvent, StepReport
+from .pixels import Pixels, choose_pixels
+from .recovery import Recovery, best_start
+from .se3 import rotation_angle_deg
+from .tracker import TrackResult, track_adam, track_direct
+from .trajectory import Trajectory
+from .types import Frame, Intrinsics
+from .views import ColorQuery, SdfQuery, queries, render_view
+from .window import random_window, select_window
+
+Interrupt = Callable[[], None]
+RELOCALISE_FROM = 5
+RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
+
+
+class Interrupted(Exception):
+    """Raised by an ``interrupt`` callback to abandon a step."""
+
+
+class Slam:
+    """The engine: feed it frames, read its trajectory and field. See the paper's figure 2."""
+
+    def __init__(
+        self,
+        config: Config,
+        intrinsics: Intrinsics,
+        *,
+        device: torch.device | None = None,
+        bounds: NDArray[np.float64] | None = None,
+        first_pose: NDArray[np.float64] | None = None,
+    ) -> None:
+        """bounds: scene box [2, 3] metres, derived from the first frame when None. first_pose: c2w [4, 4] of the first
+        frame, the identity when None; it stays fixed."""
+        self.config, self.intrinsics = config, intrinsics
+        self.device = device or torch.device("cpu")
+        self.kernels_name, self._kernels, self.kernels_note = seam.select(self.device)
+        self.trajectory = Trajectory()
+        self.keyframes: list[Keyframe] = []
+        self.mapper: Mapper | None = None
+        self._first_pose = np.eye(4) if first_pose is None else np.array(first_pose, np.float64)
+        box = config.field.box
+        self._bounds = bounds if box is None else np.array(box, np.float64).reshape(2, 3)
+        self._rng = np.random.default_rng(config.seed)
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self._loops, self._recovery = LoopDetector(), Recovery()
+        self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
+        self._pending: Future[MapResult] | None = None
+        self._window: NDArray[np.int64] = np.empty(0, np.int64)
+        self._frozen: TsdfField | None = None
+
+    # ---- one frame --------------------------------------------------------------------------------------------------
+
+    def step(self, frame: Frame, interrupt: Interrupt | None = None) -> StepReport:
+        """Track the frame; every n-th frame, map. Raises whatever ``interrupt`` raises, called inside long loops."""
+        if self.mapper is None:
+            return self._first_frame(frame, interrupt)
+        started = time.perf_counter()
+        self._apply_pending(block=False)
+        pixels = choose_pixels(frame, self.intrinsics, self.config.tracking.rays, self.config, self._rng)
+        track = self._track(frame, pixels)
+        index, lost = len(self.trajectory), self._recovery.lost
+        keyframe = index % self.config.keyframe_every == 0 and not lost
+        self.trajectory.append(track.c2w, frame.timestamp, not self._recovery.missed, keyframe)
+        tracked = time.perf_counter()
+        losses, loop = track.losses, None
+        if keyframe:
+            self._add_keyframe(frame)
+        if keyframe and index % self.config.mapping.every == 0:
+            losses, loop = self._map(frame.index, interrupt)
+        return StepReport(
+            frame=frame.index,
+            timestamp=frame.timestamp,
+            c2w=self.trajectory[-1],
+            tracked=not self._recovery.missed,
+            lost=lost,
+            is_keyframe=keyframe,
+            window=tuple(self.keyframes[i].frame for i in self._window) if keyframe else (),
+            losses=losses,
+            track_ms=1e3 * (tracked - started),
+            map_ms=1e3 * (time.perf_counter() - tracked),
+            loop=loop,
+            note=self._recovery.note,
+        )
+
+    def _first_frame(self, frame: Frame, interrupt: Interrupt | None) -> StepReport:
+        started = time.perf_counter()
+        keyframe = self._make_keyframe(frame)
+        if len(keyframe.pixels.points()) == 0:
+            raise ValueError("the first frame has no usable depth")
+        box = self._bounds
+        if box is None:
+            box = box_of_points(_world(keyframe.pixels, self._first_pose), self.config.field.box_margin_m)
+        field = create_field(self.config.field, box, self.config.seed, self.device)
+        self.mapper = Mapper(field, self._kernels, self.config, self.config.seed)
+        self.trajectory.append(self._first_pose, frame.timestamp, True, keyframe=True)
+        self.keyframes.append(keyframe)
+        try:
+            result = self._optimise(np.array([0]), self.config.mapping.first_iterations, interrupt)
+        except BaseException:
+            self.mapper = None
+            self.trajectory, self.keyframes = Trajectory(), []
+            raise
+        self._frozen = self._tracking_field()
+        return StepReport(
+            frame=frame.index,
+            timestamp=frame.timestamp,
+            c2w=self.trajectory[-1],
+            tracked=True,
+            lost=False,
+            is_keyframe=True,
+            window=(frame.index,),
+            losses=result.losses,
+            track_ms=0.0,
+            map_ms=1e3 * (time.perf_counter() - started),
+        )
+
+    def finish(self) -> None:
+        """The last mapping, with the smoothness term (paper: "at the last image frame"); call it once, at the end."""
+        self._apply_pending(block=True)
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+        if self.mapper is not None and not self._recovery.lost:
+            self._window = self._choose_window()
+            self._apply(self._optimise(self._window, self.config.mapping.iterations, None, smooth=True))
+
+    # ---- tracking ---------------------------------------------------------------------------------------------------
+
+    def _track(self, frame: Frame, pixels: Pixels) -> TrackResult:
+        """Constant-velocity start, the preset's tracker, and recovery when the map does not explain the frame."""
+        field = self._require_field()
+        guess = self.trajectory.predict() if not self._recovery.lost else self.trajectory[-1]
+        usable = len(pixels.points()) >= 64
+        track = self._track_from(field, pixels, guess) if usable else TrackResult(guess, {}, 0.0)
+        return self._recovery.judge(
+            track, self.trajectory[-1], lambda: self._relocalise(field, frame, pixels) if usable else None
+        )
+
+    def _track_from(self, field: TsdfField, pixels: Pixels, guess: NDArray[np.float64]) -> TrackResult:
+        if self.config.tracking.method == "lm":
+            return track_direct(field, self._kernels, pixels, guess, self.config)
+        return track_adam(field, self._kernels, pixels, guess, self.config, self._generator)
+
+    def _relocalise(self, field: TsdfField, frame: Frame, pixels: Pixels) -> TrackResult:
+        """Direct alignment with a wide basin from the last pose and from the keyframes that look most alike."""
+        poses = self.trajectory.keyframe_poses()
+        alike = most_similar(self.keyframes, make_thumbnail(frame.color), RELOCALISE_FROM)
+        tracking = replace(self.config.tracking, kernels_m=RELOCALISE_KERNELS_M, iterations=20)
+        wide = replace(self.config, tracking=tracking)
+        starts = [self.trajectory[-1], *(poses[i] for i in alike)]
+        return best_start(lambda start: track_direct(field, self._kernels, pixels, start, wide), starts)
+
+    # ---- mapping ----------------------------------------------------------------------------------------------------
+
+    def _map(self, frame: int, interrupt: Interrupt | None) -> tuple[dict[str, float], LoopEvent | None]:
+        """Window, joint optimisation, and an event when old keyframes come back. In ``overlap`` the optimisation runs
+        on while tracking goes on, except when a loop closes."""
+        self._apply_pending(block=True)
+        self._grow_box()
+        self._window = self._choose_window()
+        old = self._loops.update(self.trajectory.keyframe_poses(), self.trajectory[-1])
+        if self._pool is not None and len(old) == 0:
+            self._pending = self._pool.submit(self._optimise, self._window, self.config.mapping.iterations, None)
+            return {}, None
+        centres, before = self.trajectory.poses()[:, :3, 3].astype(np.float32), self.trajectory[-1]
+        result = self._optimise(self._window, self.config.mapping.iterations, interrupt)
+        self._apply(result)
+        if len(old) == 0:
+            return result.losses, None
+        after = self.trajectory[-1]
+        return result.losses, LoopEvent(
+            frame=frame,
+            keyframes=tuple(self.keyframes[i].frame for i in old),
+            correction_cm=100 * float(np.linalg.norm(after[:3, 3] - before[:3, 3])),
+            correction_deg=float(rotation_angle_deg(before, after)),
+            loss_before=result.loss_first,
+            loss_after=sum(result.losses.values()),
+            error_before_cm=None,
+            error_after_cm=None,
+            rotation_error_before_deg=None,
+            rotation_error_after_deg=None,
+            trajectory_before=centres,
+            c2w_before=before,
+        )
+
+    def _optimise(
+        self, window: NDArray[np.int64], iterations: int, interrupt: Interrupt | None, smooth: bool = False
+    ) -> MapResult:
+        assert self.mapper is not None
+        views = [self.keyframes[i].pixels for i in window]
+        poses = self.trajectory.keyframe_poses()[window]
+        return self.mapper.run(views, poses, window == 0, iterations, self.config, interrupt, smooth)
+
+    def _choose_window(self) -> NDArray[np.int64]:
+        poses, rays = self.trajectory.keyframe_poses(), self.config.mapping.rays
+        if self.config.eba:
+            return select_window(poses, poses[-1], rays, self.config.window)
+        return random_window(len(poses), rays, self.config.window, self._rng)
+
+    def _apply(self, result: MapResult) -> None:
+        if np.isfinite(result.c2w).all():
+            self.trajectory.move_keyframes(self._window, result.c2w)
+        self._frozen = self._tracking_field()
+
+    def _apply_pending(self, block: bool) -> None:
+        if self._pending is not None and (block or self._pending.done()):
+            result, self._pending = self._pending.result(), None
+            self._apply(result)
+
+    def _tracking_field(self) -> TsdfField:
+        assert self.mapper is not None
+        return self.mapper.field if self._pool is None else self.mapper.field.freeze()
+
+    # ---- keyframes, box, views --------------------------------------------------------------------------------------
+
+    def _make_keyframe(self, frame: Frame) -> Keyframe:
+        count = max(64, round(self.config.keyframe_share * frame.depth.size))
+        pixels = choose_pixels(frame, self.intrinsics, count, self.config, self._rng)
+        return Keyframe(frame.index, pixels, make_thumbnail(frame.color))
+
+    def _add_keyframe(self, frame: Frame) -> None:
+        self.keyframes.append(self._make_keyframe(frame))
+
+    def _grow_box(self) -> None:
+        """Extend the scene box when over 1 % of the newest keyframe's points lie outside it."""
+        assert self.mapper is not None
+        points = _world(self.keyframes[-1].pixels, self.trajectory[-1])
+        low, high = self.mapper.field.layout.box.numpy()
+        outside = ((points < low) | (points > high)).any(1).mean() if len(points) else 0.0
+        if self.config.field.box is None and outside > 0.01:
+            self.mapper.grow(box_of_points(points, self.config.field.box_margin_m), self.config)
+
+    def surface_points(self) -> NDArray[np.float32]:
+        """Measured points [N, 3] of all keyframes in the world, where the map has been observed."""
+        poses = self.trajectory.keyframe_poses()
+        parts = [_world(k.pixels, pose) for k, pose in zip(self.keyframes, poses, strict=True)]
+        return np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
+
+    def query(self) -> tuple[SdfQuery, ColorQuery]:
+        """Callables over a frozen copy of the map, safe to use from another thread."""
+        return queries(self._require_field().freeze(), self._kernels)
+
+    def render(
+        self, c2w: NDArray[np.float64], depth: NDArray[np.float32]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """The map's colour uint8 [h, w, 3] and depth [h, w] from c2w [4, 4], at the size of ``depth`` [h, w]."""
+        camera = self.intrinsics.resized(depth.shape[1], depth.shape[0])
+        return render_view(self._require_field(), self._kernels, camera, c2w, depth, self.config)
+
+    def configure(self, config: Config) -> None:
+        """Change tracking and mapping settings from the next frame on; the field keeps its shape."""
+        self._apply_pending(block=True)
+        self.config = replace(config, field=self.config.field, schedule=self.config.schedule, seed=self.config.seed)
+
+    def _require_field(self) -> TsdfField:
+        assert self._frozen is not None
+        return self._frozen
+
+
+def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:
+    return (pixels.points() @ c2w[:3, :3].T + c2w[:3, 3]).astype(np.float32)
