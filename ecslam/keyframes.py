@@ -25,9 +25,9 @@ class Keyframe:
 def make_thumbnail(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     """A tiny blurred picture whose dot product with another one is their correlation."""
     small = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), THUMBNAIL, interpolation=cv2.INTER_AREA)
-    flat = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.5).reshape(-1)
+    flat = np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.5), np.float32).reshape(-1)
     flat -= flat.mean()
-    return flat / max(float(np.linalg.norm(flat)), 1e-6)
+    return flat / np.float32(max(float(np.linalg.norm(flat)), 1e-6))
 
 
 def most_similar(keyframes: list[Keyframe], thumbnail: NDArray[np.float32], count: int) -> list[int]:

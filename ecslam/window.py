@@ -44,9 +44,7 @@ def select_window(
     return np.union1d(always, near[: cap - len(always)])
 
 
-def random_window(
-    count: int, rays: int, config: WindowConfig, rng: np.random.Generator
-) -> NDArray[np.int64]:
+def random_window(count: int, rays: int, config: WindowConfig, rng: np.random.Generator) -> NDArray[np.int64]:
     """The ablation without EBA: a random number of random keyframes; the current one (the last) is always in."""
     cap = max(2, min(config.size, rays // RAYS_PER_KEYFRAME, count))
     if count <= 1:

@@ -1,0 +1,52 @@
+# Two commands: `make demo` and `make test`. Each sets up everything it needs in .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+.PHONY: demo test quick check lint format setup clean help
+
+help:
+	@echo "make demo    set up and run EC-SLAM on the built-in studio"
+	@echo "make test    set up, lint, type-check and run every test"
+	@echo "make quick   the tests that take under three minutes"
+	@echo "make format  format the code"
+
+demo: $(VENV)/.ready
+	$(BIN)/ecslam demo $(DEMO)
+
+test: $(VENV)/.ready-dev lint
+	$(BIN)/python -m pytest --durations=10
+
+quick: $(VENV)/.ready-dev lint
+	$(BIN)/python -m pytest -m "not slow and not browser"
+
+check lint: $(VENV)/.ready-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy ecslam
+	$(BIN)/mypy app
+
+format: $(VENV)/.ready-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+setup: $(VENV)/.ready
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || (echo "Python 3.10 or newer is needed; name it with: make PYTHON=python3.11 ..." && exit 1)
+	$(PYTHON) -m venv $(VENV)
+
+# torch first, so that a CPU build which satisfies the pins is kept.
+$(VENV)/.ready: pyproject.toml | $(VENV)/bin/python
+	@echo "Setting up $(VENV) (a few minutes the first time) ..."
+	$(PIP) "torch>=2.10,<2.14"
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/.ready-dev: pyproject.toml $(VENV)/.ready
+	$(PIP) -e ".[dev,oracles]"
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -1,0 +1,17 @@
+"""Shared by all tests: where real recordings may lie, and one thread pool per core at most."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    """The folder with the real recordings; skips where there is none."""
+    folder = Path(os.environ.get("ECSLAM_RECORDINGS", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip("no real recordings here (set ECSLAM_RECORDINGS to their folder)")
+    return folder

@@ -1,0 +1,104 @@
+"""Strict configuration: nothing is silently ignored."""
+
+import dataclasses
+
+import pytest
+
+from ecslam import config as cfg
+from ecslam.types import InputError
+
+
+def test_defaults_are_the_papers_lite_preset():
+    assert cfg.load_preset("lite") == cfg.Config()
+
+
+@pytest.mark.parametrize(
+    ("preset", "mapping", "tracking", "samples"),
+    [
+        ("lite", (10, 2000), (8, 1000), (32, 11)),
+        ("full", (20, 4000), (20, 2000), (32, 11)),
+        ("scannet", (10, 4000), (10, 2000), (96, 21)),
+        ("tum", (20, 2000), (20, 2000), (64, 21)),
+    ],
+)
+def test_presets_carry_the_papers_counts(preset, mapping, tracking, samples):
+    c = cfg.load_preset(preset)
+    assert (c.mapping.iterations, c.mapping.rays) == mapping
+    assert (c.tracking.iterations, c.tracking.rays) == tracking
+    assert (c.sampling.uniform, c.sampling.near_depth) == samples
+    assert c.preset == preset
+
+
+@pytest.mark.parametrize("preset", cfg.preset_names())
+def test_resolved_configuration_reads_back_equal(preset, tmp_path):
+    c = cfg.load_preset(preset)
+    path = tmp_path / "config.yaml"
+    path.write_text(cfg.to_yaml(c))
+    assert cfg.load_config(path) == c
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("mapping.iteratons=3", "did you mean 'mapping.iterations'"),
+        ("iterations=3", "did you mean"),
+        ("mapping.iterations=2.5", "must be a whole number"),
+        ("mapping.iterations=many", "must be a whole number"),
+        ("mapping.iterations=-1", "out of range"),
+        ("fus=1", "must be true or false"),
+        ("schedule=fast", "strict, overlap"),
+        ("truncation_m=.nan", "must be a number"),
+        ("mapping=3", "must hold keys"),
+        ("field.box=[0, 1]", "six numbers"),
+        ("depth_near_m=9", "smaller than depth_far_m"),
+        ("seed", "key=value"),
+    ],
+)
+def test_wrong_settings_say_what_and_where(setting, says):
+    with pytest.raises(InputError, match=says) as error:
+        cfg.apply_settings(cfg.Config(), [setting])
+    assert "\n" not in str(error.value)
+
+
+def test_scientific_notation_is_a_number():
+    assert cfg.apply_settings(cfg.Config(), ["mapping.lr_grid=1e-3"]).mapping.lr_grid == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a: &x [1]\nb: *x", "aliases"),
+        ("seed: 1\nseed: 2", "stands twice"),
+        ("seed: [", "not valid YAML"),
+        ("x" * 70_000, "KiB"),
+        ("!!python/object/apply:os.system [true]", "not valid YAML"),
+        ("- 1", "must hold keys"),
+    ],
+)
+def test_hostile_files_are_refused(text, says, tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=says):
+        cfg.load_config(path, cfg.Config())
+
+
+def test_missing_file_and_unknown_preset():
+    with pytest.raises(InputError, match="did you mean 'lite'"):
+        cfg.load_preset("litte")
+    with pytest.raises(InputError, match="no such preset"):
+        cfg.load_preset("../lite")
+
+
+def test_every_field_is_read_somewhere():
+    """No setting that nothing reads."""
+    from pathlib import Path
+
+    source = "".join(p.read_text() for p in Path(cfg.__file__).parent.rglob("*.py") if p.name != "config.py")
+
+    def names(node):
+        for f in dataclasses.fields(node):
+            value = getattr(node, f.name)
+            yield from names(value) if dataclasses.is_dataclass(value) else [f.name]
+
+    unread = {n for n in names(cfg.Config()) if f".{n}" not in source}
+    assert not unread

@@ -1,0 +1,52 @@
+"""Frames hang on their keyframes."""
+
+import numpy as np
+import torch
+
+from ecslam import se3
+from ecslam.trajectory import Trajectory
+
+
+def moved(x):
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def build(count=12, every=5):
+    t = Trajectory()
+    for i in range(count):
+        t.append(moved(0.1 * i), i / 30, True, i % every == 0)
+    return t
+
+
+def test_poses_come_back_as_given():
+    t = build()
+    assert np.allclose(t.poses()[:, 0, 3], 0.1 * np.arange(12))
+    assert np.allclose(t[7], t.poses()[7])
+
+
+def test_frames_follow_their_keyframe_rigidly():
+    t = build()
+    before = t.poses()
+    turn = se3.retract(
+        torch.eye(4, dtype=torch.float64), torch.tensor([0, 0.2, 0, 0, 0, 0.3], dtype=torch.float64)
+    ).numpy()
+    t.move_keyframes(np.array([1]), (turn @ t.keyframe_poses()[1])[None])
+    after = t.poses()
+    assert np.allclose(after[:5], before[:5])
+    assert np.allclose(after[10:], before[10:])
+    assert np.allclose(after[5:10], turn @ before[5:10])
+
+
+def test_prediction_is_constant_velocity():
+    assert np.allclose(build().predict(), moved(1.2))
+
+
+def test_state_round_trip():
+    t = build()
+    again = Trajectory.restore(t.state())
+    assert (again.poses() == t.poses()).all()
+    assert again.timestamps == t.timestamps
+    again.append(moved(9), 1.0, False, False)
+    assert len(again) == len(t) + 1
