@@ -1,0 +1,369 @@
+"""Eight-lane vectors for numba: numbers of type ``f32x8`` and ``i32x8`` that jitted code can load, combine and store.
+
+numba leaves vectorising to LLVM's heuristics; these types state it. They lower to LLVM vectors, which the compiler maps
+to one AVX register, two SSE or NEON registers, or half an AVX-512 one.
+"""
+
+from __future__ import annotations
+
+import operator
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
+
+LANES = 8
+FAST = ("contract", "nsz")
+FLOAT, INT = ir.FloatType(), ir.IntType(32)
+FLOATS, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
+
+
+class FloatVector(types.Type):
+    """Eight float32."""
+
+    def __init__(self):
+        super().__init__("f32x8")
+
+
+class IntVector(types.Type):
+    """Eight int32."""
+
+    def __init__(self):
+        super().__init__("i32x8")
+
+
+@register_model(FloatVector)
+class _FloatModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, FLOATS)
+
+
+@register_model(IntVector)
+class _IntModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, INTS)
+
+
+f32x8, i32x8 = FloatVector(), IntVector()
+
+
+def _operator(function, kind, emit):
+    @type_callable(function)
+    def type_of(context):
+        return lambda a, b: kind if a == kind and b == kind else None
+
+    @lower_builtin(function, kind, kind)
+    def lower(context, builder, signature, args):
+        return emit(builder, *args)
+
+
+_operator(operator.add, f32x8, lambda b, x, y: b.fadd(x, y, flags=FAST))
+_operator(operator.sub, f32x8, lambda b, x, y: b.fsub(x, y, flags=FAST))
+_operator(operator.mul, f32x8, lambda b, x, y: b.fmul(x, y, flags=FAST))
+_operator(operator.truediv, f32x8, lambda b, x, y: b.fdiv(x, y, flags=FAST))
+_operator(operator.add, i32x8, lambda b, x, y: b.add(x, y))
+_operator(operator.sub, i32x8, lambda b, x, y: b.sub(x, y))
+_operator(operator.mul, i32x8, lambda b, x, y: b.mul(x, y))
+_operator(operator.xor, i32x8, lambda b, x, y: b.xor(x, y))
+_operator(operator.and_, i32x8, lambda b, x, y: b.and_(x, y))
+
+
+def _splat(builder, value, kind):
+    one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, INT(0))
+    return builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(INTS, [0] * LANES))
+
+
+def _pointer(context, builder, kind, array, index, element):
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), element.as_pointer())
+
+
+def _call(builder, name, *args):
+    kind = ir.FunctionType(FLOATS, [FLOATS] * len(args))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{LANES}f32"), args)
+
+
+@intrinsic
+def splat(typing, value):
+    """The float ``value`` in every lane."""
+
+    def generate(context, builder, signature, args):
+        return _splat(builder, context.cast(builder, args[0], value, types.float32), FLOATS)
+
+    return f32x8(value), generate
+
+
+@intrinsic
+def isplat(typing, value):
+    """The integer ``value`` in every lane."""
+
+    def generate(context, builder, signature, args):
+        return _splat(builder, context.cast(builder, args[0], value, types.int32), INTS)
+
+    return i32x8(value), generate
+
+
+@intrinsic
+def load(typing, array, index):
+    """Lanes array[index : index + 8] of a contiguous one-dimensional float32 or int32 array."""
+    kind = f32x8 if array.dtype == types.float32 else i32x8
+
+    def generate(context, builder, signature, args):
+        index = context.cast(builder, args[1], signature.args[1], types.intp)
+        element = FLOATS if kind == f32x8 else INTS
+        return builder.load(_pointer(context, builder, array, args[0], index, element), align=4)
+
+    return kind(array, index), generate
+
+
+@intrinsic
+def store(typing, array, index, value):
+    """Write the lanes to array[index : index + 8]."""
+
+    def generate(context, builder, signature, args):
+        index = context.cast(builder, args[1], signature.args[1], types.intp)
+        builder.store(args[2], _pointer(context, builder, array, args[0], index, args[2].type), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, index, value), generate
+
+
+@intrinsic
+def fma(typing, a, b, c):
+    """a * b + c, never reordered (fused wherever the machine can)."""
+    return f32x8(a, b, c), lambda context, builder, signature, args: _call(builder, "llvm.fmuladd", *args)
+
+
+@intrinsic
+def floor(typing, a):
+    """Largest whole number not above each lane."""
+    return f32x8(a), lambda context, builder, signature, args: _call(builder, "llvm.floor", *args)
+
+
+@intrinsic
+def to_int(typing, a):
+    """Each lane cut to an integer."""
+    return i32x8(a), lambda context, builder, signature, args: builder.fptosi(args[0], INTS)
+
+
+@intrinsic
+def lowest(typing, a, b):
+    """Lane-wise minimum; where a is not a number, b."""
+
+    def generate(context, builder, signature, args):
+        x, y = args
+        less = builder.fcmp_ordered("<", x, y) if a == f32x8 else builder.icmp_signed("<", x, y)
+        return builder.select(less, x, y)
+
+    return a(a, b), generate
+
+
+@intrinsic
+def highest(typing, a, b):
+    """Lane-wise maximum; where a is not a number, b."""
+
+    def generate(context, builder, signature, args):
+        x, y = args
+        more = builder.fcmp_ordered(">", x, y) if a == f32x8 else builder.icmp_signed(">", x, y)
+        return builder.select(more, x, y)
+
+    return a(a, b), generate
+
+
+@intrinsic
+def where_positive(typing, a, b):
+    """b where a > 0, else 0."""
+
+    def generate(context, builder, signature, args):
+        zero = ir.Constant(FLOATS, [0.0] * LANES)
+        return builder.select(builder.fcmp_ordered(">", args[0], zero), args[1], zero)
+
+    return f32x8(a, b), generate
+
+
+@intrinsic
+def where_equal(typing, a, b, c):
+    """c where a == b, else 0."""
+
+    def generate(context, builder, signature, args):
+        zero = ir.Constant(FLOATS, [0.0] * LANES)
+        return builder.select(builder.fcmp_ordered("==", args[0], args[1]), args[2], zero)
+
+    return f32x8(a, b, c), generate
+
+
+@intrinsic
+def power_of_two(typing, a):
+    """2 ** a for whole numbers a in -126..127."""
+
+    def generate(context, builder, signature, args):
+        bias, shift = ir.Constant(INTS, [127] * LANES), ir.Constant(INTS, [23] * LANES)
+        exponent = builder.add(builder.fptosi(args[0], INTS), bias)
+        return builder.bitcast(builder.shl(exponent, shift), FLOATS)
+
+    return f32x8(a), generate
+
+
+def _shuffle(builder, a, b, lanes):
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(lanes)), list(lanes)))
+
+
+# The three butterfly stages of an 8 x 8 transpose.
+STAGES = [
+    ([0, 8, 2, 10, 4, 12, 6, 14], [1, 9, 3, 11, 5, 13, 7, 15], 1),
+    ([0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15], 2),
+    ([0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15], 4),
+]
+
+
+@intrinsic
+def row_sums(typing, a, b, c, d, e, f, g, h):
+    """Lane i holds the sum of the lanes of the i-th vector."""
+
+    def generate(context, builder, signature, args):
+        rows = list(args)
+        for even, odd, _ in STAGES:
+            pairs = zip(rows[::2], rows[1::2], strict=True)
+            rows = [builder.fadd(_shuffle(builder, x, y, even), _shuffle(builder, x, y, odd)) for x, y in pairs]
+        return rows[0]
+
+    return f32x8(a, b, c, d, e, f, g, h), generate
+
+
+@intrinsic
+def transpose(typing, source, at, stride, target, to, pitch):
+    """target[to + j * pitch + i] = source[at + i * stride + j] for i, j in 0..7."""
+
+    def generate(context, builder, signature, args):
+        kinds = signature.args
+        at, stride, to, pitch = (context.cast(builder, args[i], kinds[i], types.intp) for i in (1, 2, 4, 5))
+
+        def place(kind, array, start, step, i):
+            index = builder.add(start, builder.mul(step, ir.Constant(step.type, i)))
+            return _pointer(context, builder, kind, array, index, FLOATS)
+
+        rows = [builder.load(place(source, args[0], at, stride, i), align=4) for i in range(LANES)]
+        for even, odd, step in STAGES:
+            new = list(rows)
+            for i in (i for i in range(LANES) if not i & step):
+                new[i] = _shuffle(builder, rows[i], rows[i + step], even)
+                new[i + step] = _shuffle(builder, rows[i], rows[i + step], odd)
+            rows = new
+        for i in range(LANES):
+            builder.store(rows[i], place(target, args[3], to, pitch, i), align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, at, stride, target, to, pitch), generate
+
+
+PAIR = ir.VectorType(FLOAT, 2)
+
+
+def _rows(context, builder, kind, table, index):
+    """Pointers to the eight table rows of two floats."""
+    data = context.make_array(kind)(context, builder, table).data
+    base = builder.bitcast(data, PAIR.as_pointer())
+    lanes = [builder.sext(builder.extract_element(index, INT(i)), ir.IntType(64)) for i in range(LANES)]
+    return [builder.gep(base, [lane]) for lane in lanes]
+
+
+@intrinsic
+def gather(typing, table, index):
+    """Both floats of the rows ``index`` of a flat table of rows of two."""
+
+    def generate(context, builder, signature, args):
+        pairs = [builder.load(p, align=4) for p in _rows(context, builder, table, *args)]
+
+        def join(order):
+            halves = [_shuffle(builder, pairs[a], pairs[b], range(4)) for a, b in (order[:2], order[2:])]
+            return _shuffle(builder, *halves, range(8))
+
+        low, high = join((0, 1, 4, 5)), join((2, 3, 6, 7))
+        first = _shuffle(builder, low, high, [0, 2, 8, 10, 4, 6, 12, 14])
+        second = _shuffle(builder, low, high, [1, 3, 9, 11, 5, 7, 13, 15])
+        return context.make_tuple(builder, signature.return_type, [first, second])
+
+    return types.UniTuple(f32x8, 2)(table, index), generate
+
+
+@intrinsic
+def scatter_add(typing, table, index, a, b):
+    """Add a and b to the two floats of the rows ``index``, one lane after the other (rows may repeat)."""
+
+    def generate(context, builder, signature, args):
+        _, index, first, second = args
+        for i, pointer in enumerate(_rows(context, builder, table, args[0], index)):
+            term = _shuffle(builder, first, second, [i, LANES + i])
+            builder.store(builder.fadd(builder.load(pointer, align=4), term), pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(table, index, a, b), generate
+
+
+@intrinsic
+def fetch_add(typing, array, index):
+    """Take a number: array[index] += 1 (int64), atomically; the old value."""
+
+    def generate(context, builder, signature, args):
+        index = context.cast(builder, args[1], signature.args[1], types.intp)
+        pointer = _pointer(context, builder, array, args[0], index, ir.IntType(64))
+        return builder.atomic_rmw("add", pointer, ir.IntType(64)(1), "monotonic")
+
+    return types.int64(array, index), generate
+
+
+def make_tile(rows, columns, accumulate, relu):
+    """A register tile of a matrix product: C[rows, 8 columns] (+)= A[rows, n] @ B[n, 8 columns], perhaps clipped at 0.
+
+    The jitted function takes (C, start, row stride, A, start, row stride, term stride, B, start, row stride, n), all
+    arrays flat float32. One such tile serves the forward pass and both backward passes of the first layer.
+    """
+
+    @intrinsic
+    def tile(typing, c, c0, cr, a, a0, ar, ak, b, b0, bk, n):
+        def generate(context, builder, signature, args):
+            numbers = [
+                context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 2, 4, 5, 6, 8, 9, 10)
+            ]
+            c0, cr, a0, ar, ak, b0, bk, n = numbers
+
+            def at(kind, array, element, *terms):
+                index = terms[0]
+                for step, count in zip(terms[1::2], terms[2::2], strict=True):
+                    factor = count if isinstance(count, ir.Value) else ir.Constant(step.type, count)
+                    index = builder.add(index, builder.mul(step, factor))
+                return _pointer(context, builder, kind, array, index, element)
+
+            places = [
+                at(c, args[0], FLOATS, builder.add(c0, ir.Constant(n.type, LANES * j)), cr, i)
+                for i in range(rows)
+                for j in range(columns)
+            ]
+            sums = [cgutils.alloca_once(builder, FLOATS) for _ in places]
+            for place, total in zip(places, sums, strict=True):
+                start = builder.load(place, align=4) if accumulate else ir.Constant(FLOATS, [0.0] * LANES)
+                builder.store(start, total)
+            with cgutils.for_range(builder, n) as loop:
+                k = loop.index
+                right = [
+                    builder.load(at(b, args[7], FLOATS, builder.add(b0, ir.Constant(n.type, LANES * j)), bk, k), align=4)
+                    for j in range(columns)
+                ]
+                for i in range(rows):
+                    value = builder.load(at(a, args[3], FLOAT, a0, ar, i, ak, k))
+                    left = _splat(builder, value, FLOATS)
+                    for j in range(columns):
+                        total = sums[i * columns + j]
+                        builder.store(_call(builder, "llvm.fmuladd", left, right[j], builder.load(total)), total)
+            zero = ir.Constant(FLOATS, [0.0] * LANES)
+            for place, total in zip(places, sums, strict=True):
+                value = builder.load(total)
+                if relu:
+                    value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
+                builder.store(value, place, align=4)
+            return context.get_dummy_value()
+
+        return types.void(c, c0, cr, a, a0, ar, ak, b, b0, bk, n), generate
+
+    return tile

@@ -1,0 +1,400 @@
+"""Parallel loops of the CPU back end, jitted: threads take chunks from a counter, sums are added in chunk order.
+
+Results do not depend on which thread did what, so they repeat bit for bit. Nothing but the counter is atomic.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from ._cpu_field import (
+    BOTH,
+    HALF,
+    MASK,
+    OFFSET,
+    OPTIONS,
+    carve,
+    features_back,
+    forward,
+    hidden_back,
+    points_back,
+    table_back,
+    weights_back,
+)
+from ._cpu_rays import compare, composite, pose_sums, rendered, sample_points
+from ._cpu_simd import fetch_add
+
+SPREAD = {**OPTIONS, "parallel": True, "cache": True}
+LUMINANCE = (np.float32(0.299), np.float32(0.587), np.float32(0.114))
+
+
+@njit(**OPTIONS)
+def up_to_eight(n):
+    """The next multiple of eight."""
+    return (n + 7) // 8 * 8
+
+
+@njit(**OPTIONS)
+def load_points(points, first, count, x, n, pitch):
+    """Points [N, 3] into a chunk; padding is zero."""
+    for axis in range(3):
+        for i in range(count):
+            x[axis * pitch + i] = points[first + i, axis]
+        x[axis * pitch + count : axis * pitch + n] = 0
+
+
+@njit(**OPTIONS)
+def values_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sdf, rgb):
+    """TSDF and colour of points."""
+    s = carve(kept[t], buffers[t], pitch, net.padded)
+    while True:
+        first = fetch_add(counter, 0) * pitch
+        if first >= points.shape[0]:
+            break
+        count = min(pitch, points.shape[0] - first)
+        n = up_to_eight(count)
+        load_points(points, first, count, s.x, n, pitch)
+        forward(grid, table, net, s, n, pitch, False)
+        sdf[first : first + count] = s.out[:count]
+        for i in range(count):
+            for k in range(3):
+                rgb[first + i, k] = s.out[(k + 1) * pitch + i]
+
+
+@njit(**SPREAD)
+def values_loop(threads, counter, kept, buffers, pitch, grid, net, table, points, sdf, rgb):
+    """``values_worker`` on all threads."""
+    for t in prange(threads):
+        values_worker(np.int64(t), counter, kept, buffers, pitch, grid, net, table, points, sdf, rgb)
+
+
+@njit(**OPTIONS)
+def slopes(grid, table, net, s, count, pitch, want_light):
+    """Forward, then prepare the hidden gradients of TSDF (first half) and luminance (second half)."""
+    n = up_to_eight(count)
+    forward(grid, table, net, s, n, pitch, True)
+    s.up[:n] = 1
+    for k in range(3):
+        at = (k + 1) * pitch
+        for p in range(n):
+            c = s.out[at + p]
+            s.up[at + p] = LUMINANCE[k] * c * (1 - c) if want_light else 0
+    spare = np.empty(4 * HALF, np.float32)
+    hidden_back(net, s, n, pitch, spare[:HALF], spare[HALF:])
+
+
+@njit(**OPTIONS)
+def slope_of(grid, net, s, count, pitch, half):
+    """Position gradients of TSDF (half 0) or luminance (half 1) into ``s.d_x``."""
+    n = up_to_eight(count)
+    features_back(net, s, n, pitch, half * HALF, (half + 1) * HALF)
+    points_back(grid, net, s, n, pitch, half * HALF, (half + 1) * HALF)
+
+
+@njit(**OPTIONS)
+def luminance(s, p, pitch):
+    """Luminance of point p."""
+    return LUMINANCE[0] * s.out[pitch + p] + LUMINANCE[1] * s.out[2 * pitch + p] + LUMINANCE[2] * s.out[3 * pitch + p]
+
+
+@njit(**OPTIONS)
+def gradients_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sdf, d_sdf, light, d_light):
+    """TSDF, luminance and their gradients at points."""
+    s = carve(kept[t], buffers[t], pitch, net.padded)
+    while True:
+        first = fetch_add(counter, 0) * pitch
+        if first >= points.shape[0]:
+            break
+        count = min(pitch, points.shape[0] - first)
+        load_points(points, first, count, s.x, up_to_eight(count), pitch)
+        slopes(grid, table, net, s, count, pitch, True)
+        for half in range(2):
+            target = d_light if half else d_sdf
+            slope_of(grid, net, s, count, pitch, half)
+            for i in range(count):
+                for axis in range(3):
+                    target[first + i, axis] = s.d_x[axis * pitch + i]
+        for i in range(count):
+            sdf[first + i] = s.out[i]
+            light[first + i] = luminance(s, i, pitch)
+
+
+@njit(**SPREAD)
+def gradients_loop(threads, counter, kept, buffers, pitch, grid, net, table, points, sdf, d_sdf, light, d_light):
+    """``gradients_worker`` on all threads."""
+    for t in prange(threads):
+        gradients_worker(
+            np.int64(t), counter, kept, buffers, pitch, grid, net, table, points, sdf, d_sdf, light, d_light
+        )
+
+
+@njit(**OPTIONS)
+def add_rows(sums, residual, kernel, j):
+    """One residual with its row j [6] of the Jacobian: sums is jtj (36), jtr (6), cost, inliers. Returns its weight."""
+    share = kernel * kernel / (kernel * kernel + residual * residual)
+    weight = share * share
+    for a in range(6):
+        scaled = weight * j[a]
+        for b in range(6):
+            sums[6 * a + b] += scaled * j[b]
+        sums[36 + a] += scaled * residual
+    sums[42] += 0.5 * residual * residual * share
+    return weight
+
+
+@njit(**OPTIONS)
+def jacobian(rotated, i, pitch, g, scale, j):
+    """Row [6] of the Jacobian of a residual with position gradient ``scale * g``: translation, then rotation."""
+    x, y, z = float(rotated[i]), float(rotated[pitch + i]), float(rotated[2 * pitch + i])
+    a, b, c = scale * g[i], scale * g[pitch + i], scale * g[2 * pitch + i]
+    j[0], j[1], j[2] = a, b, c
+    j[3], j[4], j[5] = y * c - z * b, z * a - x * c, x * b - y * a
+
+
+@njit(**OPTIONS)
+def align_worker(t, counter, kept, buffers, pitch, grid, net, table, c2w, points, light, settings, sums):
+    """Gauss-Newton sums [chunks, 45]: jtj, jtr, cost, inliers, used."""
+    truncation, kernel, limit, low, high, colour, colour_kernel = settings
+    s = carve(kept[t], buffers[t], pitch, net.padded)
+    rotated = np.empty(3 * pitch, np.float32)
+    keep = np.empty(pitch, np.bool_)
+    j = np.empty(6)
+    while True:
+        chunk = fetch_add(counter, 0)
+        first = chunk * pitch
+        if first >= points.shape[0]:
+            break
+        count = min(pitch, points.shape[0] - first)
+        load_points(points, first, count, s.x, up_to_eight(count), pitch)
+        for i in range(count):
+            x, y, z = s.x[i], s.x[pitch + i], s.x[2 * pitch + i]
+            for axis in range(3):
+                rotated[axis * pitch + i] = c2w[axis, 0] * x + c2w[axis, 1] * y + c2w[axis, 2] * z
+                s.x[axis * pitch + i] = rotated[axis * pitch + i] + c2w[axis, 3]
+        slopes(grid, table, net, s, count, pitch, colour > 0)
+        slope_of(grid, net, s, count, pitch, 0)
+        total = sums[chunk]
+        total[:] = 0
+        for i in range(count):
+            a, b, c = s.d_x[i], s.d_x[pitch + i], s.d_x[2 * pitch + i]
+            norm = np.sqrt(a * a + b * b + c * c) * truncation
+            keep[i] = abs(s.out[i]) < limit and norm > low and norm < high
+            if keep[i]:
+                jacobian(rotated, i, pitch, s.d_x, truncation, j)
+                total[43] += add_rows(total, s.out[i] * truncation, kernel, j) > 0.5
+                total[44] += 1
+        if colour > 0:
+            slope_of(grid, net, s, count, pitch, 1)
+            for i in range(count):
+                if keep[i]:
+                    jacobian(rotated, i, pitch, s.d_x, colour, j)
+                    residual = (luminance(s, i, pitch) - light[first + i]) * colour
+                    add_rows(total, residual, colour_kernel * colour, j)
+
+
+@njit(**SPREAD)
+def align_loop(threads, counter, kept, buffers, pitch, grid, net, table, c2w, points, light, settings, sums):
+    """``align_worker`` on all threads."""
+    for t in prange(threads):
+        align_worker(np.int64(t), counter, kept, buffers, pitch, grid, net, table, c2w, points, light, settings, sums)
+
+
+@njit(**OPTIONS)
+def render_worker(t, counter, kept, buffers, chunk_rays, grid, net, table, beta, rays, color, depth, weights):
+    """Colour, depth and weights of rays."""
+    samples = rays.z.shape[1]
+    pitch = up_to_eight(chunk_rays * samples)
+    s = carve(kept[t], buffers[t], pitch, net.padded)
+    while True:
+        first = fetch_add(counter, 0) * chunk_rays
+        if first >= rays.z.shape[0]:
+            break
+        count = min(chunk_rays, rays.z.shape[0] - first)
+        n = up_to_eight(count * samples)
+        sample_points(rays, first, count, s.x, n, pitch)
+        forward(grid, table, net, s, n, pitch, False)
+        composite(beta, count, samples, s, n)
+        for i in range(count):
+            r, at = first + i, i * samples
+            color[r, 0], color[r, 1], color[r, 2], depth[r] = rendered(rays.z[r], at, s, pitch)
+            weights[r] = s.weight[at : at + samples]
+
+
+@njit(**SPREAD)
+def render_loop(threads, counter, kept, buffers, chunk_rays, grid, net, table, beta, rays, color, depth, weights):
+    """``render_worker`` on all threads."""
+    for t in prange(threads):
+        render_worker(
+            np.int64(t), counter, kept, buffers, chunk_rays, grid, net, table, beta, rays, color, depth, weights
+        )
+
+
+@njit(**OPTIONS)
+def step_worker(
+    t,
+    counter,
+    kept,
+    buffers,
+    chunk_rays,
+    groups,
+    grid,
+    net,
+    table,
+    beta,
+    rays,
+    w,
+    counts,
+    want_params,
+    want_poses,
+    losses,
+    partial,
+    sums,
+):
+    """One step up to the decoders: losses [groups, 5], decoder gradients partial [groups, size] and ray sums [R, 6].
+
+    Leaves each chunk's positions and feature gradients in ``kept`` for ``table_loop`` if parameters are wanted.
+    """
+    samples = rays.z.shape[1]
+    total = rays.z.shape[0]
+    pitch = up_to_eight(chunk_rays * samples)
+    chunks = (total + chunk_rays - 1) // chunk_rays
+    share = (chunks + groups - 1) // groups
+    a = net.padded * BOTH
+    b = a + net.blob.shape[0]
+    while True:
+        group = fetch_add(counter, 0)
+        if group >= groups:
+            break
+        own = partial[group]
+        own[:] = 0
+        losses[group] = 0
+        for chunk in range(group * share, min((group + 1) * share, chunks)):
+            s = carve(kept[chunk if want_params else t], buffers[t], pitch, net.padded)
+            first = chunk * chunk_rays
+            count = min(chunk_rays, total - first)
+            n = up_to_eight(count * samples)
+            sample_points(rays, first, count, s.x, n, pitch)
+            forward(grid, table, net, s, n, pitch, want_poses)
+            composite(beta, count, samples, s, n)
+            d_beta = compare(rays, first, count, beta, w, counts, s, n, pitch, losses[group])
+            if want_params or want_poses:
+                own[b + 4 * HALF] += d_beta
+                hidden_back(net, s, n, pitch, own[b : b + HALF], own[b + HALF : b + 4 * HALF])
+                features_back(net, s, n, pitch, 0, BOTH)
+            if want_params:
+                weights_back(grid, net, s, n, pitch, own[:a], own[a:b])
+            if want_poses:
+                points_back(grid, net, s, n, pitch, 0, BOTH)
+                pose_sums(rays.z, first, count, s, pitch, sums)
+
+
+@njit(**SPREAD)
+def step_loop(
+    threads,
+    counter,
+    kept,
+    buffers,
+    chunk_rays,
+    groups,
+    grid,
+    net,
+    table,
+    beta,
+    rays,
+    w,
+    counts,
+    want_params,
+    want_poses,
+    losses,
+    partial,
+    sums,
+):
+    """``step_worker`` on all threads."""
+    for t in prange(threads):
+        step_worker(
+            np.int64(t),
+            counter,
+            kept,
+            buffers,
+            chunk_rays,
+            groups,
+            grid,
+            net,
+            table,
+            beta,
+            rays,
+            w,
+            counts,
+            want_params,
+            want_poses,
+            losses,
+            partial,
+            sums,
+        )
+
+
+@njit(**OPTIONS)
+def table_worker(counter, kept, chunk_rays, grid, padded, total, samples, d_table):
+    """Gradient of the whole table from what ``step_loop`` kept: a level belongs to one thread at a time."""
+    pitch = up_to_eight(chunk_rays * samples)
+    chunks = (total + chunk_rays - 1) // chunk_rays
+    levels = grid.levels.shape[0]
+    while True:
+        level = levels - 1 - fetch_add(counter, 0)
+        if level < 0:
+            break
+        first, rows = grid.levels[level, OFFSET], grid.levels[level, MASK] + 1
+        d_table[2 * first : 2 * (first + rows)] = 0
+        for chunk in range(chunks):
+            n = up_to_eight(min(chunk_rays, total - chunk * chunk_rays) * samples)
+            table_back(grid, level, kept[chunk, : 3 * pitch], kept[chunk, 3 * pitch :], n, pitch, d_table)
+
+
+@njit(**SPREAD)
+def table_loop(threads, counter, kept, chunk_rays, grid, padded, total, samples, d_table):
+    """``table_worker`` on all threads."""
+    for _ in prange(threads):
+        table_worker(counter, kept, chunk_rays, grid, padded, total, samples, d_table)
+
+
+@njit(cache=True, **OPTIONS)
+def fill_net(w_in, w_sdf, w_rgb, features, bins, padded, flat, flat_t, blob, sdf, rgb):
+    """Lay the decoders out as ``Net`` wants them."""
+    flat[features * BOTH :] = 0
+    for i in range(features):
+        for j in range(BOTH):
+            flat[i * BOTH + j] = w_in[i, j]
+            flat_t[j * padded + i] = w_in[i, j]
+    for j in range(BOTH):
+        flat_t[j * padded + features : (j + 1) * padded] = 0
+    for axis in range(3):
+        for i in range(bins + 2):
+            source = features + axis * bins + (i - 1) % bins
+            at = (axis * (bins + 2) + i) * BOTH
+            blob[at : at + BOTH] = w_in[source]
+    for j in range(HALF):
+        sdf[j] = w_sdf[j, 0]
+        for k in range(3):
+            rgb[k * HALF + j] = w_rgb[j, k]
+
+
+@njit(cache=True, **OPTIONS)
+def add_partials(partial, features, bins, padded, w_in, w_sdf, w_rgb, beta):
+    """Decoder gradients from the groups' partial sums, in group order."""
+    total = np.zeros(partial.shape[1], np.float32)
+    for group in range(partial.shape[0]):
+        total += partial[group]
+    for i in range(features):
+        w_in[i] = total[i * BOTH : (i + 1) * BOTH]
+    w_in[features:] = 0
+    at = padded * BOTH
+    for axis in range(3):
+        for i in range(bins + 2):
+            w_in[features + axis * bins + (i - 1) % bins] += total[at : at + BOTH]
+            at += BOTH
+    for j in range(HALF):
+        w_sdf[j, 0] = total[at + j]
+        for k in range(3):
+            w_rgb[j, k] = total[at + HALF + k * HALF + j]
+    beta[0] = total[at + 4 * HALF]

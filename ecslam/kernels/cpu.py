@@ -1,0 +1,206 @@
+"""The fused CPU back end (numba): one pass over chunks of points that fit a core's cache, eight points to a vector.
+
+Why it is fast: the first layer reads 41 of its 80 inputs (three one-blob bins an axis), derivatives of the features are
+kept so that the table is gathered once, and the table gradient is scattered with one thread a level, so without
+atomics. Results repeat bit for bit. Two threads may call at the same time. float32; agrees with ``reference`` to
+about 1e-5.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+try:
+    from numba.np.ufunc import omppool as _pool  # noqa: F401
+except ImportError:
+    try:
+        from numba.np.ufunc import tbbpool as _pool  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            "numba finds neither OpenMP nor TBB here; install libgomp1 or the Python package tbb"
+        ) from error
+
+numba.config.THREADING_LAYER = "threadsafe"
+
+from ._cpu_field import BOTH, HALF, Grid, Net, scratch_floats  # noqa: E402
+from ._cpu_rays import Rays, count_rays, pose_gradients  # noqa: E402
+from ._cpu_work import (  # noqa: E402
+    add_partials,
+    align_loop,
+    fill_net,
+    gradients_loop,
+    render_loop,
+    step_loop,
+    table_loop,
+    values_loop,
+)
+from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights  # noqa: E402
+
+CHUNK_POINTS = 256
+CHUNK_RAYS = 8
+GROUPS = 32
+ALONE = 4096  # points below which one thread is faster
+
+Floats = NDArray[np.float32]
+
+
+class _Workspace(threading.local):
+    """Buffers and the last layout of each calling thread: fresh pages cost more than the arithmetic on them."""
+
+    def __init__(self) -> None:
+        self.buffers: dict[str, Floats] = {}
+        self.layout: GridLayout | None = None
+        self.grid: Grid | None = None
+
+    def array(self, name: str, *shape: int) -> Floats:
+        """An uninitialised float32 array that lives until the next request of that name."""
+        size = int(np.prod(shape))
+        held = self.buffers.get(name)
+        if held is None or held.size < size:
+            held = self.buffers[name] = np.empty(size, np.float32)
+        return held[:size].reshape(shape)
+
+
+_workspace = _Workspace()
+
+
+def _array(tensor: Tensor) -> NDArray[Any]:
+    """A view of a float32 tensor (a copy if it is neither float32 nor contiguous)."""
+    return tensor.detach().to(torch.float32).contiguous().numpy()
+
+
+def _grid(layout: GridLayout) -> Grid:
+    if layout is not _workspace.layout or _workspace.grid is None:
+        columns = [layout.offset[:, None], layout.size[:, None] - 1, layout.first, layout.dims]
+        geometry = [layout.anchor, layout.blob_low, 1 / layout.blob_size, layout.box[0], layout.box[1]]
+        _workspace.grid = Grid(
+            torch.cat(columns, 1).to(torch.int32).contiguous().numpy(),
+            (1 / layout.voxel).numpy(),
+            torch.cat(geometry).numpy(),
+            layout.bins,
+        )
+        _workspace.layout = layout
+    return _workspace.grid
+
+
+def _net(layout: GridLayout, params: FieldParams) -> Net:
+    features = 2 * layout.levels
+    padded = (features + 15) // 16 * 16
+    net = Net(
+        _workspace.array("features", padded * BOTH),
+        _workspace.array("features_t", BOTH * padded),
+        _workspace.array("blob", 3 * (layout.bins + 2) * BOTH),
+        _workspace.array("sdf", HALF),
+        _workspace.array("rgb", 3 * HALF),
+        padded,
+    )
+    w_in, w_sdf, w_rgb = _array(params.w_in), _array(params.w_sdf), _array(params.w_rgb)
+    fill_net(w_in, w_sdf, w_rgb, features, layout.bins, padded, *net[:5])
+    return net
+
+
+def _buffers(chunks: int, points: int, pitch: int, padded: int) -> tuple[int, NDArray[np.int64], Floats, Floats]:
+    """How many threads, a fresh counter, ``chunks`` blocks to keep (at least one a thread) and a buffer per thread."""
+    threads = 1 if points < ALONE else numba.get_num_threads()
+    keep, rest = scratch_floats(pitch, padded)
+    kept = _workspace.array("kept", max(chunks, threads), keep)
+    return threads, np.zeros(1, np.int64), kept, _workspace.array("scratch", threads, rest)
+
+
+def _rays(c2w: Tensor, rays: RayBatch) -> Rays:
+    batch = [_array(t) for t in (c2w, rays.direction, rays.z, rays.depth, rays.color)]
+    return Rays(*batch, rays.feature.contiguous().numpy(), rays.pose.contiguous().numpy())
+
+
+def values(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor]:
+    """See ``reference.values``."""
+    n = points.shape[0]
+    sdf, rgb = torch.empty(n), torch.empty(n, 3)
+    net = _net(layout, params)
+    work = _buffers(0, n, CHUNK_POINTS, net.padded)
+    table = _array(params.table).reshape(-1)
+    values_loop(*work, CHUNK_POINTS, _grid(layout), net, table, _array(points), sdf.numpy(), rgb.numpy())
+    return sdf, rgb
+
+
+def gradients(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See ``reference.gradients``."""
+    n = points.shape[0]
+    found = torch.empty(n), torch.empty(n, 3), torch.empty(n), torch.empty(n, 3)
+    net = _net(layout, params)
+    work = _buffers(0, n, CHUNK_POINTS, net.padded)
+    table = _array(params.table).reshape(-1)
+    gradients_loop(*work, CHUNK_POINTS, _grid(layout), net, table, _array(points), *(t.numpy() for t in found))
+    return found
+
+
+def render(layout: GridLayout, params: FieldParams, c2w: Tensor, rays: RayBatch) -> tuple[Tensor, Tensor, Tensor]:
+    """See ``reference.render``."""
+    count, samples = rays.z.shape
+    found = torch.empty(count, 3), torch.empty(count), torch.empty(count, samples)
+    net = _net(layout, params)
+    work = _buffers(0, count * samples, CHUNK_RAYS * samples, net.padded)
+    table, beta = _array(params.table).reshape(-1), np.float32(params.beta.item())
+    batch = _rays(c2w, rays)
+    render_loop(*work, CHUNK_RAYS, _grid(layout), net, table, beta, batch, *(t.numpy() for t in found))
+    return found
+
+
+def step(
+    layout: GridLayout,
+    params: FieldParams,
+    c2w: Tensor,
+    rays: RayBatch,
+    weights: Weights,
+    into: FieldParams | None,
+    want_poses: bool,
+) -> StepResult:
+    """See ``reference.step``."""
+    count, samples = rays.z.shape
+    chunks = -(-count // CHUNK_RAYS)
+    net, grid, batch = _net(layout, params), _grid(layout), _rays(c2w, rays)
+    kept = chunks if into is not None else 0
+    threads, counter, keep, buffers = _buffers(kept, count * samples, CHUNK_RAYS * samples, net.padded)
+    w = np.array([getattr(weights, name) for name in Weights.__dataclass_fields__], np.float32)
+    groups = min(GROUPS, chunks)
+    losses, sums = np.zeros((groups, 5)), _workspace.array("sums", count, 6)
+    partial = _workspace.array("partial", groups, net.padded * BOTH + net.blob.size + 4 * HALF + 1)
+    if groups:
+        step_loop(
+            threads, counter, keep, buffers, CHUNK_RAYS, groups, grid, net, _array(params.table).reshape(-1),
+            np.float32(params.beta.item()), batch, w, count_rays(batch.depth, batch.feature),
+            into is not None, want_poses, losses, partial, sums,
+        )  # fmt: skip
+    if into is not None:
+        counter[0] = 0
+        table_loop(threads, counter, keep, CHUNK_RAYS, grid, net.padded, count, samples, into.table.numpy().reshape(-1))
+        targets = (t.numpy() for t in (into.w_in, into.w_sdf, into.w_rgb, into.beta))
+        add_partials(partial, 2 * layout.levels, layout.bins, net.padded, *targets)
+    d_c2w = torch.empty(c2w.shape[0], 3, 4) if want_poses else None
+    if d_c2w is not None:
+        pose_gradients(batch, sums, d_c2w.numpy())
+    return StepResult(torch.from_numpy(losses.sum(0)).float(), d_c2w)
+
+
+def normal_equations(
+    layout: GridLayout, params: FieldParams, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
+) -> NormalEquations:
+    """See ``reference.normal_equations``."""
+    n = points.shape[0]
+    net, grid = _net(layout, params), _grid(layout)
+    work = _buffers(0, n, CHUNK_POINTS, net.padded)
+    sums = np.zeros((-(-n // CHUNK_POINTS), 45))
+    numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
+    table = _array(params.table).reshape(-1)
+    align_loop(*work, CHUNK_POINTS, grid, net, table, _array(c2w), _array(points), _array(luminance), numbers, sums)
+    total = torch.from_numpy(sums.sum(0))
+    return NormalEquations(
+        total[:36].reshape(6, 6).clone(), total[36:42].clone(), float(total[42]), int(total[44]), int(total[43])
+    )
