@@ -45,7 +45,7 @@ def test_features_are_corners_and_come_first(frame):
     assert len(pixels) == 1000
     assert pixels.feature.sum() == len(corners) > 100
     assert pixels.feature[: len(corners)].all()
-    v, u = np.divmod(corners, 640)
+    _v, u = np.divmod(corners, 640)
     assert (
         np.abs((u + 0.5) / 20 - np.rint((u + 0.5) / 20)).max() < 0.2
     )  # the picture's corners lie on a 20-pixel lattice
