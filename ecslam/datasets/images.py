@@ -1,0 +1,180 @@
+"""Reading one image file that may be broken: headers first, nothing decoded that is not what the sequence promises.
+
+OpenCV hands back None for an empty file, a full-size picture for half a JPEG, and gigabytes for a PNG of two megabytes
+that claims to be huge. Here each of these is a ``FrameError`` that names the file.
+"""
+
+from __future__ import annotations
+
+import stat
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import FrameError
+
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # broken files are reported by exception, once
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+JPEG_SIGNATURE = b"\xff\xd8"
+HEADER_BYTES = 1 << 18
+NO_DEPTH = 65535  # what several cameras write instead of 0
+
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_WITHOUT_LENGTH = frozenset(range(0xD0, 0xDA)) | {0x01}
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What a file says about itself before it is decoded. bits: per channel."""
+
+    kind: str
+    width: int
+    height: int
+    channels: int
+    bits: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.width, self.height
+
+
+def read_header(path: Path) -> ImageHeader:
+    """The header of a PNG or JPEG file, from its first bytes. Raises FrameError."""
+    return _parse_header(path, _read_bytes(path, HEADER_BYTES))
+
+
+def read_color(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """An 8-bit image as RGB uint8 [H, W, 3]. size: the (width, height) it must have. Raises FrameError."""
+    data, header = _read_checked(path, size)
+    if header.bits != 8:
+        raise FrameError(
+            f"{path}: a {header.bits}-bit {header.kind}, but colour must have 8 bits; is it a depth image?"
+        )
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cast("NDArray[np.uint8]", _decode(path, data, flags, (size[1], size[0], 3), np.uint8))
+    cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+    return image
+
+
+def read_depth(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
+    """A 16-bit grey PNG, values as stored, uint16 [H, W]. size: the (width, height) it must have. Raises FrameError."""
+    data, header = _read_checked(path, size)
+    if (header.kind, header.bits, header.channels) != ("PNG", 16, 1):
+        found = f"{header.bits}-bit {header.kind} with {header.channels} channels"
+        raise FrameError(
+            f"{path}: a {found}, but depth must be a 16-bit PNG with one; export it again without conversion"
+        )
+    return cast("NDArray[np.uint16]", _decode(path, data, cv2.IMREAD_UNCHANGED, (size[1], size[0]), np.uint16))
+
+
+def to_metres(raw: NDArray[np.uint16], scale: float) -> NDArray[np.float32]:
+    """Depth in metres, float32 [H, W], from uint16 with ``scale`` units per metre; 0 and 65535 become exactly 0."""
+    metres: NDArray[np.float32] = np.divide(raw, np.float32(scale), dtype=np.float32)
+    metres[raw == NO_DEPTH] = 0
+    return metres
+
+
+def _read_checked(path: Path, size: tuple[int, int]) -> tuple[bytes, ImageHeader]:
+    """The bytes of a complete image of the wanted size, still encoded."""
+    limit = (1 << 20) + 8 * size[0] * size[1]
+    data = _read_bytes(path, limit + 1)
+    header = _parse_header(path, data)
+    if header.size != size:
+        raise FrameError(f"{path}: {_by(header.size)} pixels, but this sequence has {_by(size)}; remove or replace it")
+    if len(data) > limit:
+        raise FrameError(f"{path}: over {limit >> 20} MiB, too much for {_by(size)} pixels; replace it")
+    if header.kind == "PNG":
+        _check_png(path, data)
+    elif not data[-64:].rstrip(b"\0").endswith(b"\xff\xd9"):
+        raise FrameError(f"{path}: truncated JPEG (no end marker); copy it again")
+    return data, header
+
+
+def _read_bytes(path: Path, limit: int) -> bytes:
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise FrameError(f"{path}: not a regular file; replace it by an image")
+        with path.open("rb") as file:
+            data = file.read(limit)
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read ({error.strerror}); put the image back") from None
+    if not data:
+        raise FrameError(f"{path}: empty file; copy it again")
+    return data
+
+
+def _parse_header(path: Path, data: bytes) -> ImageHeader:
+    if data.startswith(PNG_SIGNATURE):
+        header = _png_header(data)
+    elif data.startswith(JPEG_SIGNATURE):
+        header = _jpeg_header(data)
+    else:
+        raise FrameError(f"{path}: neither PNG nor JPEG; convert it to one of them")
+    if header is None or header.width < 1 or header.height < 1:
+        raise FrameError(f"{path}: damaged or truncated header; copy it again")
+    return header
+
+
+def _png_header(data: bytes) -> ImageHeader | None:
+    if len(data) < 26 or data[12:16] != b"IHDR":
+        return None
+    width, height, bits, colour_type = struct.unpack_from(">IIBB", data, 16)
+    channels = _PNG_CHANNELS.get(colour_type)
+    return None if channels is None else ImageHeader("PNG", width, height, channels, bits)
+
+
+def _jpeg_header(data: bytes) -> ImageHeader | None:
+    """Walk the segments up to the start of frame (ITU T.81, B.1.1)."""
+    at = 2
+    while at + 10 <= len(data):
+        if data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        if marker in _START_OF_FRAME:
+            bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+            return ImageHeader("JPEG", width, height, channels, bits)
+        if marker == 0xFF:
+            at += 1
+        elif marker in _WITHOUT_LENGTH:
+            at += 2
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
+def _check_png(path: Path, data: bytes) -> None:
+    """Every chunk complete with the right checksum, up to IEND (PNG specification, section 5)."""
+    at, view = len(PNG_SIGNATURE), memoryview(data)
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(view[at : at + 4], "big")
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(view[at + 4 : end]) != int.from_bytes(view[end : end + 4], "big"):
+            raise FrameError(f"{path}: damaged PNG (wrong checksum); copy it again")
+        if data[at + 4 : at + 8] == b"IEND":
+            return
+        at = end + 4
+    raise FrameError(f"{path}: truncated PNG (no end chunk); copy it again")
+
+
+def _decode(path: Path, data: bytes, flags: int, shape: tuple[int, ...], dtype: type) -> NDArray[np.generic]:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None or image.shape != shape or image.dtype != dtype:
+        raise FrameError(f"{path}: cannot be decoded; copy it again")
+    return cast("NDArray[np.generic]", image)
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

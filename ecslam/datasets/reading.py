@@ -1,0 +1,183 @@
+"""Small readers that the layouts share: numbered files, matrices, intrinsics, image sizes, lists of poses."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import FrameError, InputError, Intrinsics
+from .images import read_header
+
+MAX_PIXELS = 64_000_000
+MAX_TEXT_BYTES = 64 << 20
+INTRINSICS_FILE = "camera-intrinsics.txt"
+
+
+def numbered(folder: Path, pattern: str) -> dict[int, Path]:
+    """Files of ``folder`` whose whole name matches ``pattern``, by the number in its first group, ascending."""
+    regex = re.compile(pattern)
+    if not folder.is_dir():
+        return {}
+    matches = ((regex.fullmatch(path.name), path) for path in sorted(folder.iterdir()))
+    found = {int(match[1]): path for match, path in matches if match}
+    return dict(sorted(found.items()))
+
+
+def has_numbered(folder: Path, pattern: str) -> bool:
+    """Whether any file name in ``folder`` matches ``pattern`` as a whole."""
+    return folder.is_dir() and any(re.fullmatch(pattern, path.name) for path in folder.iterdir())
+
+
+def paired(color: dict[int, Path], depth: dict[int, Path], folder: Path) -> list[int]:
+    """The frame numbers, once it is sure that each has both images. Raises InputError naming the first that has not."""
+    alone = sorted(color.keys() ^ depth.keys())
+    if alone:
+        missing, present = ("depth", color) if alone[0] in color else ("colour", depth)
+        raise InputError(
+            f"{folder}: {len(color)} colour and {len(depth)} depth images; {present[alone[0]].name} is the first "
+            f"without its {missing} image; add the missing files or remove those left over"
+        )
+    if not color:
+        raise InputError(f"{folder}: no colour and depth images; give the folder that holds them")
+    return list(color)
+
+
+def read_text(path: Path) -> str:
+    """A text file of sensible size. Raises InputError."""
+    try:
+        if path.stat().st_size > MAX_TEXT_BYTES:
+            raise InputError(f"{path}: over {MAX_TEXT_BYTES >> 20} MiB of text; is it the right file?")
+        return path.read_text("utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file") from None
+
+
+def read_numbers(path: Path) -> NDArray[np.float64]:
+    """All numbers of a text file, flat; ``inf`` and ``nan`` are allowed. Raises InputError."""
+    try:
+        return np.array(read_text(path).replace(",", " ").split(), np.float64)
+    except ValueError:
+        raise InputError(f"{path}: holds something that is not a number; write plain numbers") from None
+
+
+def read_intrinsics(path: Path, width: int, height: int) -> Intrinsics:
+    """Intrinsics from a 3x3 or 4x4 calibration matrix in a text file. Raises InputError."""
+    values = read_numbers(path)
+    if values.size not in (9, 16) or not np.isfinite(values).all():
+        raise InputError(f"{path}: {values.size} numbers, but a calibration matrix is 3x3 (or 4x4) finite numbers")
+    k = values.reshape(3, 3) if values.size == 9 else values.reshape(4, 4)
+    return Intrinsics(float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]), width, height)
+
+
+def find_intrinsics(
+    folders: list[Path], default: Intrinsics, size: tuple[int, int]
+) -> tuple[Intrinsics, tuple[str, ...]]:
+    """From the first ``camera-intrinsics.txt`` in ``folders``, else ``default`` scaled to ``size``; and notes on it.
+
+    Raises InputError when the default belongs to images of another shape.
+    """
+    for folder in folders:
+        if (folder / INTRINSICS_FILE).is_file():
+            return read_intrinsics(folder / INTRINSICS_FILE, *size), ()
+    if size == (default.width, default.height):
+        return default, ()
+    made_for, here = f"{default.width}x{default.height}", f"{size[0]}x{size[1]}"
+    if size[0] * default.height != size[1] * default.width:
+        raise InputError(
+            f"{folders[0]}: {here} images, but this camera has {made_for}; "
+            f"write its 3x3 matrix to {INTRINSICS_FILE} there"
+        )
+    note = f"no {INTRINSICS_FILE}: the usual intrinsics for {made_for} were scaled to {here}"
+    return default.resized(*size), (note,)
+
+
+def common_size(files: list[Path], samples: int = 9) -> tuple[int, int]:
+    """The (width, height) that most of some spread files have, from headers alone. Raises InputError."""
+    sizes: Counter[tuple[int, int]] = Counter()
+    problem = ""
+    for i in np.linspace(0, len(files) - 1, min(samples, len(files))).astype(int):
+        try:
+            sizes[read_header(files[i]).size] += 1
+        except FrameError as error:
+            problem = problem or str(error)
+    if not sizes:
+        raise InputError(f"none of the images looked at is readable, the first being {problem}")
+    (width, height), _ = sizes.most_common(1)[0]
+    if width * height > MAX_PIXELS:
+        raise InputError(f"{files[0].parent}: images of {width}x{height} pixels; at most {MAX_PIXELS} pixels are read")
+    return width, height
+
+
+def same_size(color_files: list[Path], depth_files: list[Path]) -> tuple[int, int]:
+    """The size that colour and depth share. Raises InputError when they do not."""
+    color, depth = common_size(color_files), common_size(depth_files)
+    if color != depth:
+        raise InputError(
+            f"{color_files[0].parent}: colour images are {color[0]}x{color[1]} but depth images {depth[0]}x{depth[1]}; "
+            "this layout has both at one size, pixel on pixel: export them again, registered"
+        )
+    return depth
+
+
+def finite_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[N] whether all of a pose [N, 4, 4] is finite."""
+    return cast("NDArray[np.bool_]", np.logical_and.reduce(np.isfinite(poses), axis=(1, 2)))
+
+
+def rigid(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Poses [N, 4, 4] with NaN for each that is not finite or not a rigid motion, and a note when there are any."""
+    safe = np.where(finite_poses(poses)[:, None, None], poses, 0.0)
+    rotation = safe[:, :3, :3]
+    square = rotation @ rotation.transpose(0, 2, 1) - np.eye(3)
+    good = (np.abs(square).max((1, 2)) < 1e-2) & (np.linalg.det(rotation) > 0)
+    good &= np.abs(safe[:, 3] - [0, 0, 0, 1]).max(1) < 1e-6
+    bad = int((~good).sum())
+    notes = (
+        (f"{bad} of {len(poses)} ground-truth poses are missing, infinite or not rigid and are left out",)
+        if bad
+        else ()
+    )
+    return np.where(good[:, None, None], poses, np.nan), notes
+
+
+def read_pose_files(files: list[Path | None]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """Poses [N, 4, 4] from one 4x4 text file a frame (None = it has none), and notes; None when no frame has one."""
+    if not any(files):
+        return None, ()
+    poses = np.full((len(files), 4, 4), np.nan)
+    for i, path in enumerate(files):
+        if path is not None:
+            try:
+                values = read_numbers(path)
+            except InputError:
+                continue
+            if values.size == 16:
+                poses[i] = values.reshape(4, 4)
+    return rigid(poses)
+
+
+def read_pose_list(path: Path, numbers: list[int]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """Poses [N, 4, 4] of frames ``numbers`` from a file with one 4x4 matrix a frame, and notes; None without the file.
+
+    Raises InputError when the file has fewer poses than the highest frame number asks for.
+    """
+    if not path.is_file():
+        return None, ()
+    values = read_numbers(path)
+    if values.size % 16:
+        raise InputError(f"{path}: {values.size} numbers, not a multiple of 16; write one 4x4 matrix for each frame")
+    poses = values.reshape(-1, 4, 4)
+    if len(poses) <= max(numbers):
+        raise InputError(
+            f"{path}: {len(poses)} poses, but the images go up to frame {max(numbers)}; add the missing poses"
+        )
+    spare = len(poses) - len(numbers)
+    found, notes = rigid(poses[list(numbers)])
+    return found, (*notes, f"{path.name} has {spare} poses without images") if spare else notes
