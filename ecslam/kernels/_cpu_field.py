@@ -31,7 +31,8 @@ from ._cpu_simd import (
     where_positive,
 )
 
-OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}}
+OUTER = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "cache": True}
+INNER = {**OUTER, "cache": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 BOTH = 64
 HALF = 32
 P1, P2 = -1640531535, 805459861
@@ -95,7 +96,7 @@ def scratch_floats(pitch, padded):
     return pitch * (3 + padded), pitch * (4 * padded + 3 + 3 + 9 + 6 + BOTH + 4 + 4 + 3 + 4) + 8 * padded
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def carve(kept, buffer, pitch, padded):
     """A Scratch inside flat buffers: positions and feature gradients (for ``table_back``) in ``kept``."""
     x, d_enc = kept[: 3 * pitch], kept[3 * pitch :]
@@ -129,7 +130,7 @@ def carve(kept, buffer, pitch, padded):
     )
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def place(grid, s, n, pitch):
     """Clamp world positions in ``s.x`` onto the box, note which axes moved, find the one-blob bins and their values."""
     bins, one = grid.bins, splat(np.float32(1))
@@ -162,7 +163,7 @@ def place(grid, s, n, pitch):
             store(s.slope, (2 * axis + 1) * pitch + p, steep * (one - b) * (one - b))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def corners(levels, level, x, y, z):
     """Table rows of the eight corners (x fastest) of the cell with integer coordinates x, y, z."""
     one, offset = isplat(1), isplat(levels[level, OFFSET])
@@ -196,7 +197,7 @@ def corners(levels, level, x, y, z):
     )
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def mix(v, fx, fy, fz):
     """Trilinear value of eight corner values and its derivatives per cell."""
     a, b, c, d = v[1] - v[0], v[3] - v[2], v[5] - v[4], v[7] - v[6]
@@ -208,7 +209,7 @@ def mix(v, fx, fy, fz):
     return bottom + fz * rise, near + fz * (far - near), low + fz * (high - low), rise
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def encode(grid, table, s, n, pitch, padded, want_jac):
     """Hash features of the points in ``s.x`` (paper, equation 1) and, if wanted, their derivatives."""
     for level in range(grid.levels.shape[0]):
@@ -234,7 +235,7 @@ def encode(grid, table, s, n, pitch, padded, want_jac):
                 store(s.jac, (2 * padded + 1) * pitch + at, z1 * inverse)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def blob_layer(blob, bins, s, n, pitch):
     """First-layer sums of the one-blob inputs: starts ``s.hidden``."""
     for p in range(n):
@@ -251,7 +252,7 @@ def blob_layer(blob, bins, s, n, pitch):
             store(s.hidden, BOTH * p + v, x + y + z)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def dot(a, i, b, j):
     """Lane-wise partial sums of the dot product of two rows of 32."""
     return (load(a, i) * load(b, j) + load(a, i + 8) * load(b, j + 8)) + (
@@ -259,7 +260,7 @@ def dot(a, i, b, j):
     )
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def dots(a, i, b, j):
     """Dot products of eight rows of 32, BOTH apart, with one row."""
     return row_sums(
@@ -274,7 +275,7 @@ def dots(a, i, b, j):
     )
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def exp_parts(x):
     """(2^k, e^r - 1) with e^x = 2^k e^r and |r| <= ln 2 / 2."""
     x = lowest(highest(x, splat(np.float32(-87))), splat(np.float32(88)))
@@ -289,28 +290,28 @@ def exp_parts(x):
     return power_of_two(k), fma(r * r, q, r)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def exp(x):
     """e^x to about 1e-7."""
     power, rest = exp_parts(x)
     return fma(power, rest, power)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def expm1(x):
     """e^x - 1, exact to rounding near 0 too."""
     power, rest = exp_parts(x)
     return fma(power, rest, power - splat(np.float32(1)))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def sigmoid(x):
     """1 / (1 + e^-x)."""
     one = splat(np.float32(1))
     return one / (one + exp(splat(np.float32(0)) - x))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def decode(net, s, n, pitch):
     """TSDF and colour of the points from ``s.hidden``."""
     for p in range(0, n, 8):
@@ -320,7 +321,7 @@ def decode(net, s, n, pitch):
             store(s.out, (channel + 1) * pitch + p, sigmoid(raw))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def forward(grid, table, net, s, n, pitch, want_jac):
     """From world positions in ``s.x`` to TSDF and colour in ``s.out``; n is a multiple of 8."""
     place(grid, s, n, pitch)
@@ -333,7 +334,7 @@ def forward(grid, table, net, s, n, pitch, want_jac):
     decode(net, s, n, pitch)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def hidden_back(net, s, n, pitch, d_sdf, d_rgb):
     """Turn hidden activations into their gradients in place, from ``s.up``; adds the second layer's gradients."""
     for v in range(0, HALF, 8):
@@ -356,7 +357,7 @@ def hidden_back(net, s, n, pitch, d_sdf, d_rgb):
         store(d_rgb, 2 * HALF + v, tb)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def features_back(net, s, n, pitch, first, last):
     """Gradients of the hash features from hidden units first..last of ``s.hidden``, into ``s.d_enc``."""
     padded = net.padded
@@ -371,7 +372,7 @@ def features_back(net, s, n, pitch, first, last):
             transpose(s.turn, v, padded, s.d_enc, v * pitch + p, pitch)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def blob_slope(blob, at, g0, g1, hidden, h, first, last):
     """Lane-wise partial sums of the derivative along one axis through the one-blob inputs."""
     left, right = splat(g0), splat(g1)
@@ -382,7 +383,7 @@ def blob_slope(blob, at, g0, g1, hidden, h, first, last):
     return total
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def points_back(grid, net, s, n, pitch, first, last):
     """Gradients of the positions, into ``s.d_x``, from ``s.d_enc`` and hidden units first..last of ``s.hidden``."""
     blob, bins = net.blob, grid.bins
@@ -405,7 +406,7 @@ def points_back(grid, net, s, n, pitch, first, last):
             store(s.d_x, axis * pitch + p, total * load(s.inside, axis * pitch + p))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def weights_back(grid, net, s, n, pitch, d_features, d_blob):
     """Add the first layer's gradients: d_features [padded, 64], d_blob [3, bins + 2, 64]."""
     for v in range(0, BOTH, 16):
@@ -425,7 +426,7 @@ def weights_back(grid, net, s, n, pitch, d_features, d_blob):
                 store(d_blob, at + v + 2 * BOTH, load(d_blob, at + v + 2 * BOTH) + c * g)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def corner_pair(d_table, left, right, gx, fx, weight, a, b):
     """Scatter the gradients a, b to two corners that are neighbours along x."""
     low, high = weight * gx, weight * fx
@@ -433,7 +434,7 @@ def corner_pair(d_table, left, right, gx, fx, weight, a, b):
     scatter_add(d_table, right, high * a, high * b)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def table_back(grid, level, x, d_enc, n, pitch, d_table):
     """Add one level's rows of the table gradient from a chunk of points: x [3, pitch], d_enc [padded, pitch]."""
     inverse, one = splat(grid.inverse[level]), splat(np.float32(1))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ._cpu_field import OPTIONS, exp, expm1, sigmoid
+from ._cpu_field import INNER, OUTER, exp, expm1, sigmoid
 from ._cpu_simd import load, splat, store
 
 FREE, CENTRE, TAIL, DEPTH_UNIFORM, DEPTH_FEATURE, COLOUR_UNIFORM, COLOUR_FEATURE, TRUNCATION, CENTRE_SHARE = range(9)
@@ -25,7 +25,7 @@ class Rays(NamedTuple):
     pose: np.ndarray
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def sample_points(rays, first, count, x, n, pitch):
     """World positions [3, pitch] of all samples of ``count`` rays."""
     samples = rays.z.shape[1]
@@ -42,7 +42,7 @@ def sample_points(rays, first, count, x, n, pitch):
         x[axis * pitch + count * samples : axis * pitch + n] = 0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def composite(beta, count, samples, s, n):
     """Rendering weights (paper, equations 2 and 3): fills ``sharp`` (sigmoid), ``alpha``, ``before`` (transmittance)
     and ``weight``."""
@@ -64,7 +64,7 @@ def composite(beta, count, samples, s, n):
         store(s.weight, p, passed * load(s.alpha, p))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def rendered(z, at, s, pitch):
     """Colour and depth of the ray whose samples start at ``at``."""
     r, g, b, depth = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -77,7 +77,7 @@ def rendered(z, at, s, pitch):
     return r, g, b, depth
 
 
-@njit(**OPTIONS)
+@njit(**OUTER)
 def count_rays(depth, feature):
     """How many rays have a depth, are uniform, are features, are uniform with depth, are features with depth (at
     least 1 each: they divide)."""
@@ -92,7 +92,7 @@ def count_rays(depth, feature):
     return np.maximum(counts, np.float32(1))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def sdf_terms(z, depth, w, measured, at, s, losses):
     """Free-space, centre and tail losses of one ray (paper, equations 4 and 5); their gradients start ``s.up``."""
     samples = z.shape[0]
@@ -129,7 +129,7 @@ def sdf_terms(z, depth, w, measured, at, s, losses):
     losses[2] += scale_t * sum_t
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def render_back(z, at, beta, c_r, c_g, c_b, c_d, s, pitch):
     """Through the compositing of one ray: adds to ``s.up``, returns the gradient of beta. c_*: gradients of the
     rendered colour and depth."""
@@ -151,7 +151,7 @@ def render_back(z, at, beta, c_r, c_g, c_b, c_d, s, pitch):
     return d_beta
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def compare(rays, first, count, beta, w, counts, s, n, pitch, losses):
     """Losses of a chunk of rays, added to ``losses`` [5] float64; their gradients go to ``s.up``. Returns d beta."""
     samples = rays.z.shape[1]
@@ -178,7 +178,7 @@ def compare(rays, first, count, beta, w, counts, s, n, pitch, losses):
     return d_beta
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def pose_sums(z, first, count, s, pitch, sums):
     """Per ray: the sums of position gradients and of position gradients times depth, into sums [R, 6]."""
     samples = z.shape[1]
@@ -193,7 +193,7 @@ def pose_sums(z, first, count, s, pitch, sums):
             sums[first + i, 3 + axis] = times_z
 
 
-@njit(**OPTIONS)
+@njit(**OUTER)
 def pose_gradients(rays, sums, d_c2w):
     """Gradients [P, 3, 4] of the poses from the per-ray sums, in ray order."""
     total = np.zeros(d_c2w.shape, np.float64)

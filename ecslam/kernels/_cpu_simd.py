@@ -323,9 +323,7 @@ def make_tile(rows, columns, accumulate, relu):
     @intrinsic
     def tile(typing, c, c0, cr, a, a0, ar, ak, b, b0, bk, n):
         def generate(context, builder, signature, args):
-            numbers = [
-                context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 2, 4, 5, 6, 8, 9, 10)
-            ]
+            numbers = [context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 2, 4, 5, 6, 8, 9, 10)]
             c0, cr, a0, ar, ak, b0, bk, n = numbers
 
             def at(kind, array, element, *terms):
@@ -347,7 +345,9 @@ def make_tile(rows, columns, accumulate, relu):
             with cgutils.for_range(builder, n) as loop:
                 k = loop.index
                 right = [
-                    builder.load(at(b, args[7], FLOATS, builder.add(b0, ir.Constant(n.type, LANES * j)), bk, k), align=4)
+                    builder.load(
+                        at(b, args[7], FLOATS, builder.add(b0, ir.Constant(n.type, LANES * j)), bk, k), align=4
+                    )
                     for j in range(columns)
                 ]
                 for i in range(rows):

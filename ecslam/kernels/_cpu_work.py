@@ -6,14 +6,15 @@ Results do not depend on which thread did what, so they repeat bit for bit. Noth
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from ._cpu_field import (
     BOTH,
     HALF,
+    INNER,
     MASK,
     OFFSET,
-    OPTIONS,
+    OUTER,
     carve,
     features_back,
     forward,
@@ -25,17 +26,16 @@ from ._cpu_field import (
 from ._cpu_rays import compare, composite, pose_sums, rendered, sample_points
 from ._cpu_simd import fetch_add
 
-SPREAD = {**OPTIONS, "parallel": True, "cache": True}
 LUMINANCE = (np.float32(0.299), np.float32(0.587), np.float32(0.114))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def up_to_eight(n):
     """The next multiple of eight."""
     return (n + 7) // 8 * 8
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def load_points(points, first, count, x, n, pitch):
     """Points [N, 3] into a chunk; padding is zero."""
     for axis in range(3):
@@ -44,7 +44,7 @@ def load_points(points, first, count, x, n, pitch):
         x[axis * pitch + count : axis * pitch + n] = 0
 
 
-@njit(**OPTIONS)
+@njit(**OUTER)
 def values_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sdf, rgb):
     """TSDF and colour of points."""
     s = carve(kept[t], buffers[t], pitch, net.padded)
@@ -62,14 +62,7 @@ def values_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sd
                 rgb[first + i, k] = s.out[(k + 1) * pitch + i]
 
 
-@njit(**SPREAD)
-def values_loop(threads, counter, kept, buffers, pitch, grid, net, table, points, sdf, rgb):
-    """``values_worker`` on all threads."""
-    for t in prange(threads):
-        values_worker(np.int64(t), counter, kept, buffers, pitch, grid, net, table, points, sdf, rgb)
-
-
-@njit(**OPTIONS)
+@njit(**INNER)
 def slopes(grid, table, net, s, count, pitch, want_light):
     """Forward, then prepare the hidden gradients of TSDF (first half) and luminance (second half)."""
     n = up_to_eight(count)
@@ -84,7 +77,7 @@ def slopes(grid, table, net, s, count, pitch, want_light):
     hidden_back(net, s, n, pitch, spare[:HALF], spare[HALF:])
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def slope_of(grid, net, s, count, pitch, half):
     """Position gradients of TSDF (half 0) or luminance (half 1) into ``s.d_x``."""
     n = up_to_eight(count)
@@ -92,13 +85,13 @@ def slope_of(grid, net, s, count, pitch, half):
     points_back(grid, net, s, n, pitch, half * HALF, (half + 1) * HALF)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def luminance(s, p, pitch):
     """Luminance of point p."""
     return LUMINANCE[0] * s.out[pitch + p] + LUMINANCE[1] * s.out[2 * pitch + p] + LUMINANCE[2] * s.out[3 * pitch + p]
 
 
-@njit(**OPTIONS)
+@njit(**OUTER)
 def gradients_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sdf, d_sdf, light, d_light):
     """TSDF, luminance and their gradients at points."""
     s = carve(kept[t], buffers[t], pitch, net.padded)
@@ -120,16 +113,7 @@ def gradients_worker(t, counter, kept, buffers, pitch, grid, net, table, points,
             light[first + i] = luminance(s, i, pitch)
 
 
-@njit(**SPREAD)
-def gradients_loop(threads, counter, kept, buffers, pitch, grid, net, table, points, sdf, d_sdf, light, d_light):
-    """``gradients_worker`` on all threads."""
-    for t in prange(threads):
-        gradients_worker(
-            np.int64(t), counter, kept, buffers, pitch, grid, net, table, points, sdf, d_sdf, light, d_light
-        )
-
-
-@njit(**OPTIONS)
+@njit(**INNER)
 def add_rows(sums, residual, kernel, j):
     """One residual with its row j [6] of the Jacobian: sums is jtj (36), jtr (6), cost, inliers. Returns its weight."""
     share = kernel * kernel / (kernel * kernel + residual * residual)
@@ -143,7 +127,7 @@ def add_rows(sums, residual, kernel, j):
     return weight
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def jacobian(rotated, i, pitch, g, scale, j):
     """Row [6] of the Jacobian of a residual with position gradient ``scale * g``: translation, then rotation."""
     x, y, z = float(rotated[i]), float(rotated[pitch + i]), float(rotated[2 * pitch + i])
@@ -152,7 +136,7 @@ def jacobian(rotated, i, pitch, g, scale, j):
     j[3], j[4], j[5] = y * c - z * b, z * a - x * c, x * b - y * a
 
 
-@njit(**OPTIONS)
+@njit(**OUTER)
 def align_worker(t, counter, kept, buffers, pitch, grid, net, table, c2w, points, light, settings, sums):
     """Gauss-Newton sums [chunks, 45]: jtj, jtr, cost, inliers, used."""
     truncation, kernel, limit, low, high, colour, colour_kernel = settings
@@ -193,14 +177,7 @@ def align_worker(t, counter, kept, buffers, pitch, grid, net, table, c2w, points
                     add_rows(total, residual, colour_kernel * colour, j)
 
 
-@njit(**SPREAD)
-def align_loop(threads, counter, kept, buffers, pitch, grid, net, table, c2w, points, light, settings, sums):
-    """``align_worker`` on all threads."""
-    for t in prange(threads):
-        align_worker(np.int64(t), counter, kept, buffers, pitch, grid, net, table, c2w, points, light, settings, sums)
-
-
-@njit(**OPTIONS)
+@njit(**OUTER)
 def render_worker(t, counter, kept, buffers, chunk_rays, grid, net, table, beta, rays, color, depth, weights):
     """Colour, depth and weights of rays."""
     samples = rays.z.shape[1]
@@ -221,16 +198,7 @@ def render_worker(t, counter, kept, buffers, chunk_rays, grid, net, table, beta,
             weights[r] = s.weight[at : at + samples]
 
 
-@njit(**SPREAD)
-def render_loop(threads, counter, kept, buffers, chunk_rays, grid, net, table, beta, rays, color, depth, weights):
-    """``render_worker`` on all threads."""
-    for t in prange(threads):
-        render_worker(
-            np.int64(t), counter, kept, buffers, chunk_rays, grid, net, table, beta, rays, color, depth, weights
-        )
-
-
-@njit(**OPTIONS)
+@njit(**OUTER)
 def step_worker(
     t,
     counter,
@@ -289,53 +257,8 @@ def step_worker(
                 pose_sums(rays.z, first, count, s, pitch, sums)
 
 
-@njit(**SPREAD)
-def step_loop(
-    threads,
-    counter,
-    kept,
-    buffers,
-    chunk_rays,
-    groups,
-    grid,
-    net,
-    table,
-    beta,
-    rays,
-    w,
-    counts,
-    want_params,
-    want_poses,
-    losses,
-    partial,
-    sums,
-):
-    """``step_worker`` on all threads."""
-    for t in prange(threads):
-        step_worker(
-            np.int64(t),
-            counter,
-            kept,
-            buffers,
-            chunk_rays,
-            groups,
-            grid,
-            net,
-            table,
-            beta,
-            rays,
-            w,
-            counts,
-            want_params,
-            want_poses,
-            losses,
-            partial,
-            sums,
-        )
-
-
-@njit(**OPTIONS)
-def table_worker(counter, kept, chunk_rays, grid, padded, total, samples, d_table):
+@njit(**OUTER)
+def table_worker(t, counter, kept, chunk_rays, grid, padded, total, samples, d_table):
     """Gradient of the whole table from what ``step_loop`` kept: a level belongs to one thread at a time."""
     pitch = up_to_eight(chunk_rays * samples)
     chunks = (total + chunk_rays - 1) // chunk_rays
@@ -351,14 +274,7 @@ def table_worker(counter, kept, chunk_rays, grid, padded, total, samples, d_tabl
             table_back(grid, level, kept[chunk, : 3 * pitch], kept[chunk, 3 * pitch :], n, pitch, d_table)
 
 
-@njit(**SPREAD)
-def table_loop(threads, counter, kept, chunk_rays, grid, padded, total, samples, d_table):
-    """``table_worker`` on all threads."""
-    for _ in prange(threads):
-        table_worker(counter, kept, chunk_rays, grid, padded, total, samples, d_table)
-
-
-@njit(cache=True, **OPTIONS)
+@njit(**OUTER)
 def fill_net(w_in, w_sdf, w_rgb, features, bins, padded, flat, flat_t, blob, sdf, rgb):
     """Lay the decoders out as ``Net`` wants them."""
     flat[features * BOTH :] = 0
@@ -379,7 +295,7 @@ def fill_net(w_in, w_sdf, w_rgb, features, bins, padded, flat, flat_t, blob, sdf
             rgb[k * HALF + j] = w_rgb[j, k]
 
 
-@njit(cache=True, **OPTIONS)
+@njit(**OUTER)
 def add_partials(partial, features, bins, padded, w_in, w_sdf, w_rgb, beta):
     """Decoder gradients from the groups' partial sums, in group order."""
     total = np.zeros(partial.shape[1], np.float32)

@@ -9,39 +9,29 @@ about 1e-5.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-try:
-    from numba.np.ufunc import omppool as _pool  # noqa: F401
-except ImportError:
-    try:
-        from numba.np.ufunc import tbbpool as _pool  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            "numba finds neither OpenMP nor TBB here; install libgomp1 or the Python package tbb"
-        ) from error
-
-numba.config.THREADING_LAYER = "threadsafe"
-
-from ._cpu_field import BOTH, HALF, Grid, Net, scratch_floats  # noqa: E402
-from ._cpu_rays import Rays, count_rays, pose_gradients  # noqa: E402
-from ._cpu_work import (  # noqa: E402
+from ._cpu_field import BOTH, HALF, Grid, Net, scratch_floats
+from ._cpu_rays import Rays, count_rays, pose_gradients
+from ._cpu_work import (
     add_partials,
-    align_loop,
+    align_worker,
     fill_net,
-    gradients_loop,
-    render_loop,
-    step_loop,
-    table_loop,
-    values_loop,
+    gradients_worker,
+    render_worker,
+    step_worker,
+    table_worker,
+    values_worker,
 )
-from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights  # noqa: E402
+from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
 
 CHUNK_POINTS = 256
 CHUNK_RAYS = 8
@@ -106,12 +96,30 @@ def _net(layout: GridLayout, params: FieldParams) -> Net:
     return net
 
 
-def _buffers(chunks: int, points: int, pitch: int, padded: int) -> tuple[int, NDArray[np.int64], Floats, Floats]:
-    """How many threads, a fresh counter, ``chunks`` blocks to keep (at least one a thread) and a buffer per thread."""
-    threads = 1 if points < ALONE else numba.get_num_threads()
+@cache
+def _helpers(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads - 1, "ecslam-kernels")
+
+
+def _spread(threads: int, worker: Callable[..., None], *args: Any) -> None:
+    """Run ``worker(t, counter, *args)`` on this thread and on helpers, all taking work from one counter.
+
+    Workers release the GIL and leave when nothing is left, so helpers that are busy elsewhere are not waited for.
+    """
+    counter = np.zeros(1, np.int64)
+    others = [_helpers(threads).submit(worker, t, counter, *args) for t in range(1, threads)]
+    worker(0, counter, *args)
+    for other in others:
+        if not other.cancel():
+            other.result()
+
+
+def _buffers(chunks: int, points: int, pitch: int, padded: int) -> tuple[int, Floats, Floats]:
+    """How many threads, ``chunks`` blocks to keep (at least one a thread) and a buffer per thread."""
+    threads = 1 if points < ALONE else torch.get_num_threads()
     keep, rest = scratch_floats(pitch, padded)
     kept = _workspace.array("kept", max(chunks, threads), keep)
-    return threads, np.zeros(1, np.int64), kept, _workspace.array("scratch", threads, rest)
+    return threads, kept, _workspace.array("scratch", threads, rest)
 
 
 def _rays(c2w: Tensor, rays: RayBatch) -> Rays:
@@ -124,9 +132,11 @@ def values(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Ten
     n = points.shape[0]
     sdf, rgb = torch.empty(n), torch.empty(n, 3)
     net = _net(layout, params)
-    work = _buffers(0, n, CHUNK_POINTS, net.padded)
+    threads, *work = _buffers(0, n, CHUNK_POINTS, net.padded)
     table = _array(params.table).reshape(-1)
-    values_loop(*work, CHUNK_POINTS, _grid(layout), net, table, _array(points), sdf.numpy(), rgb.numpy())
+    _spread(
+        threads, values_worker, *work, CHUNK_POINTS, _grid(layout), net, table, _array(points), sdf.numpy(), rgb.numpy()
+    )
     return sdf, rgb
 
 
@@ -135,9 +145,19 @@ def gradients(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[
     n = points.shape[0]
     found = torch.empty(n), torch.empty(n, 3), torch.empty(n), torch.empty(n, 3)
     net = _net(layout, params)
-    work = _buffers(0, n, CHUNK_POINTS, net.padded)
+    threads, *work = _buffers(0, n, CHUNK_POINTS, net.padded)
     table = _array(params.table).reshape(-1)
-    gradients_loop(*work, CHUNK_POINTS, _grid(layout), net, table, _array(points), *(t.numpy() for t in found))
+    _spread(
+        threads,
+        gradients_worker,
+        *work,
+        CHUNK_POINTS,
+        _grid(layout),
+        net,
+        table,
+        _array(points),
+        *(t.numpy() for t in found),
+    )
     return found
 
 
@@ -146,10 +166,12 @@ def render(layout: GridLayout, params: FieldParams, c2w: Tensor, rays: RayBatch)
     count, samples = rays.z.shape
     found = torch.empty(count, 3), torch.empty(count), torch.empty(count, samples)
     net = _net(layout, params)
-    work = _buffers(0, count * samples, CHUNK_RAYS * samples, net.padded)
+    threads, *work = _buffers(0, count * samples, CHUNK_RAYS * samples, net.padded)
     table, beta = _array(params.table).reshape(-1), np.float32(params.beta.item())
     batch = _rays(c2w, rays)
-    render_loop(*work, CHUNK_RAYS, _grid(layout), net, table, beta, batch, *(t.numpy() for t in found))
+    _spread(
+        threads, render_worker, *work, CHUNK_RAYS, _grid(layout), net, table, beta, batch, *(t.numpy() for t in found)
+    )
     return found
 
 
@@ -167,20 +189,21 @@ def step(
     chunks = -(-count // CHUNK_RAYS)
     net, grid, batch = _net(layout, params), _grid(layout), _rays(c2w, rays)
     kept = chunks if into is not None else 0
-    threads, counter, keep, buffers = _buffers(kept, count * samples, CHUNK_RAYS * samples, net.padded)
+    threads, keep, buffers = _buffers(kept, count * samples, CHUNK_RAYS * samples, net.padded)
     w = np.array([getattr(weights, name) for name in Weights.__dataclass_fields__], np.float32)
     groups = min(GROUPS, chunks)
     losses, sums = np.zeros((groups, 5)), _workspace.array("sums", count, 6)
     partial = _workspace.array("partial", groups, net.padded * BOTH + net.blob.size + 4 * HALF + 1)
     if groups:
-        step_loop(
-            threads, counter, keep, buffers, CHUNK_RAYS, groups, grid, net, _array(params.table).reshape(-1),
+        _spread(
+            threads, step_worker, keep, buffers, CHUNK_RAYS, groups, grid, net, _array(params.table).reshape(-1),
             np.float32(params.beta.item()), batch, w, count_rays(batch.depth, batch.feature),
             into is not None, want_poses, losses, partial, sums,
         )  # fmt: skip
     if into is not None:
-        counter[0] = 0
-        table_loop(threads, counter, keep, CHUNK_RAYS, grid, net.padded, count, samples, into.table.numpy().reshape(-1))
+        _spread(
+            threads, table_worker, keep, CHUNK_RAYS, grid, net.padded, count, samples, into.table.numpy().reshape(-1)
+        )
         targets = (t.numpy() for t in (into.w_in, into.w_sdf, into.w_rgb, into.beta))
         add_partials(partial, 2 * layout.levels, layout.bins, net.padded, *targets)
     d_c2w = torch.empty(c2w.shape[0], 3, 4) if want_poses else None
@@ -195,11 +218,24 @@ def normal_equations(
     """See ``reference.normal_equations``."""
     n = points.shape[0]
     net, grid = _net(layout, params), _grid(layout)
-    work = _buffers(0, n, CHUNK_POINTS, net.padded)
+    threads, *work = _buffers(0, n, CHUNK_POINTS, net.padded)
     sums = np.zeros((-(-n // CHUNK_POINTS), 45))
     numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
     table = _array(params.table).reshape(-1)
-    align_loop(*work, CHUNK_POINTS, grid, net, table, _array(c2w), _array(points), _array(luminance), numbers, sums)
+    _spread(
+        threads,
+        align_worker,
+        *work,
+        CHUNK_POINTS,
+        grid,
+        net,
+        table,
+        _array(c2w),
+        _array(points),
+        _array(luminance),
+        numbers,
+        sums,
+    )
     total = torch.from_numpy(sums.sum(0))
     return NormalEquations(
         total[:36].reshape(6, 6).clone(), total[36:42].clone(), float(total[42]), int(total[44]), int(total[43])
