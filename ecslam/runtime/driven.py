@@ -1,0 +1,122 @@
+"""What the runtime asks of the engine proper, so that tests can drive it with another one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config import Config
+from ..messages import StepReport
+from ..types import Frame, Intrinsics
+
+State = dict[str, NDArray[Any]]
+
+
+class Abandoned(Exception):
+    """Raised by the ``interrupt`` that ``SlamLike.step`` is given, through ``step``, to leave a frame unfinished."""
+
+
+class TrajectoryLike(Protocol):
+    """The part of ``ecslam.trajectory.Trajectory`` that is read here."""
+
+    timestamps: list[float]
+
+    def poses(self) -> NDArray[np.float64]:
+        """Poses [n, 4, 4] of all frames."""
+        ...
+
+
+class FieldLike(Protocol):
+    """The part of ``ecslam.field.TsdfField`` that is read here."""
+
+    @property
+    def parameters(self) -> int:
+        """How many learnt numbers there are."""
+        ...
+
+
+class SlamLike(Protocol):
+    """The part of ``ecslam.slam.Slam`` that the runtime drives; see there."""
+
+    kernels_name: str
+    kernels_note: str
+
+    @property
+    def trajectory(self) -> TrajectoryLike:
+        """Poses of the frames so far."""
+        ...
+
+    @property
+    def field(self) -> FieldLike | None:
+        """The map, or None before the first frame's mapping has begun. With a map, ``query`` and ``render`` work."""
+        ...
+
+    def step(self, frame: Frame, interrupt: Callable[[], None] | None = None) -> StepReport:
+        """Process a frame; ``interrupt`` is called inside long loops and may raise to abandon it."""
+        ...
+
+    def finish(self) -> None:
+        """The last mapping."""
+        ...
+
+    def surface_points(self) -> NDArray[np.float32]:
+        """Measured points [N, 3] in the world."""
+        ...
+
+    def query(self) -> tuple[Callable[[NDArray[np.float32]], Any], Callable[[NDArray[np.float32]], NDArray[np.uint8]]]:
+        """TSDF and colour over a frozen copy of the map."""
+        ...
+
+    def render(
+        self, c2w: NDArray[np.float64], depth: NDArray[np.float32]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Colour and depth at the size of ``depth``."""
+        ...
+
+    def configure(self, config: Config) -> None:
+        """Other tracking and mapping settings from the next frame on."""
+        ...
+
+    def state(self) -> State:
+        """Everything that ``restore`` needs; arrays that nobody writes to afterwards."""
+        ...
+
+
+class SlamFactory(Protocol):
+    """Makes the engine proper, fresh or, with ``state``, as it was when that was taken."""
+
+    def __call__(
+        self,
+        config: Config,
+        intrinsics: Intrinsics,
+        *,
+        device: str,
+        bounds: NDArray[np.float64] | None,
+        first_pose: NDArray[np.float64] | None,
+        state: State | None,
+    ) -> SlamLike:
+        """See the class."""
+        ...
+
+
+def make_slam(
+    config: Config,
+    intrinsics: Intrinsics,
+    *,
+    device: str,
+    bounds: NDArray[np.float64] | None,
+    first_pose: NDArray[np.float64] | None,
+    state: State | None,
+) -> SlamLike:
+    """The ``SlamFactory`` of ``ecslam.slam.Slam``. torch is imported here and not before."""
+    import torch
+
+    from ..slam import Slam
+
+    place = torch.device(device)
+    if state is not None:
+        return Slam.restore(config, intrinsics, state, device=place)
+    return Slam(config, intrinsics, device=place, bounds=bounds, first_pose=first_pose)

@@ -1,0 +1,301 @@
+"""The engine: takes commands, drives ``Slam`` over a sequence on one thread, and publishes what happens.
+
+``run`` works in the calling thread and returns when the sequence is done; ``start`` works in a thread of its own, which
+stays for exports and restarts until ``Quit``. One thread drives, one job thread makes meshes and exports, one writes
+checkpoints; whoever steers only calls ``submit``.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from .. import config as configuration
+from .. import datasets
+from ..config import Config
+from ..messages import Command, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
+from ..types import Frame, FrameError, InputError, Sequence
+from .checkpoint import Checkpoint, load_checkpoint
+from .control import Control, Turn
+from .driven import Abandoned, SlamFactory, make_slam
+from .feed import Feed, FeedSubscription
+from .run import Plan, Run
+from .runfolder import RunFolder
+from .workshop import Workshop
+
+CHECKPOINT_EVERY = 5
+SNAPSHOT_PERIOD_S = 1 / 30
+
+Items = Iterator[tuple[int, Frame | FrameError]]
+
+
+class Engine:
+    """An ``EngineHandle`` that runs ``Slam``.
+
+    sequence: an opened one or an address for ``open_sequence``; frames: ``A:B:STEP``, "" = all. out: the run folder.
+    sequences: addresses that ``Restart`` may ask for. checkpoint_every: frames between checkpoints, a kill costs at
+    most twice as many. Raises InputError when the sequence cannot be opened.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        sequence: Sequence | str,
+        out: Path,
+        *,
+        device: str = "cpu",
+        frames: str = "",
+        sequences: tuple[str, ...] = (),
+        checkpoint_every: int = CHECKPOINT_EVERY,
+        open_sequence: Callable[[str], Sequence] = datasets.open_sequence,
+        make: SlamFactory = make_slam,
+        resumed: Checkpoint | None = None,
+    ) -> None:
+        address = sequence if isinstance(sequence, str) else sequence.name
+        opened = open_sequence(sequence) if isinstance(sequence, str) else sequence
+        self._plan = Plan(config, datasets.select_frames(opened, frames), address, frames, device, out)
+        self._sequences = tuple(dict.fromkeys((address, *sequences)))
+        self._given = {address: opened}
+        self._open_sequence, self._make, self._checkpoint_every = open_sequence, make, checkpoint_every
+        self._resumed = resumed
+        self._feed = Feed()
+        self._workshop = workshop = Workshop(self._feed)
+        self._control = Control(config, self._feed.publish, self._sequences, self.presets, lambda: workshop.waiting)
+        self._run: Run | None = None
+        self._thread: threading.Thread | None = None
+        self._progress: Callable[[Snapshot], None] = lambda snapshot: None
+        self._next_snapshot = 0.0
+        self.summary: dict[str, Any] | None = None
+        self.error: Exception | None = None
+
+    @classmethod
+    def resume(cls, folder: Path, *, sequence: Sequence | None = None, **options: Any) -> Engine:
+        """Go on with an interrupted run in ``folder``; ``options`` as for the class. sequence: where its address, the
+        one in ``run.json``, cannot be opened again. Raises InputError."""
+        checkpoint = load_checkpoint(folder / "checkpoints")
+        if checkpoint.meta["finished"]:
+            raise InputError(f"{folder}: this run is finished; look at it with: ecslam view {folder}")
+        config = configuration.apply(Config(), checkpoint.meta["config"], str(folder))
+        opened = sequence or checkpoint.meta["sequence"]
+        return cls(config, opened, folder, frames=checkpoint.meta["frames"], resumed=checkpoint, **options)
+
+    # ---- the handle: any thread -----------------------------------------------------------------------------------
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Addresses that ``Restart`` accepts."""
+        return self._sequences
+
+    @property
+    def presets(self) -> tuple[str, ...]:
+        """Names that ``Restart`` and ``LoadPreset`` accept."""
+        return tuple(configuration.preset_names())
+
+    @property
+    def run_folder(self) -> Path:
+        """Where this run writes; a restart moves on to a new folder beside it."""
+        return self._plan.out
+
+    def submit(self, command: Command) -> int:
+        """Take a command up and return its id; its ``Ack`` is published before this returns."""
+        return self._control.submit(command)
+
+    def latest(self) -> Snapshot | None:
+        """The newest snapshot, or None before the first."""
+        return self._feed.latest()
+
+    def subscribe(self) -> FeedSubscription:
+        """Start reading the feed from now on."""
+        return self._feed.subscribe()
+
+    # ---- life -----------------------------------------------------------------------------------------------------
+
+    def run(self, progress: Callable[[Snapshot], None] | None = None) -> dict[str, Any]:
+        """Run to the end of the sequence (or ``Stop`` or ``Quit``) in this thread and return the summary.
+
+        progress: called with every snapshot. Raises what stopped the run: InputError for what a user can mend.
+        """
+        self._progress = progress or self._progress
+        self._main(stay=False)
+        if self.error is not None:
+            raise self.error
+        assert self.summary is not None
+        return self.summary
+
+    def start(self, progress: Callable[[Snapshot], None] | None = None) -> None:
+        """Run in the background and stay until ``Quit``. See ``error`` and ``summary``."""
+        self._progress = progress or self._progress
+        self._thread = threading.Thread(target=self._main, args=(True,), name="engine", daemon=True)
+        self._thread.start()
+
+    def join(self, timeout_s: float | None = None) -> bool:
+        """Wait until the background thread has ended; False on time-out."""
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+        return self._thread is None or not self._thread.is_alive()
+
+    def _main(self, stay: bool) -> None:
+        try:
+            turn = self._one_run()
+            while turn is Turn.RESTART or (stay and turn is not Turn.QUIT):
+                if turn is Turn.RESTART:
+                    turn = self._restart()
+                else:
+                    turn = self._control.next_turn(0.0)
+                    if turn is Turn.WORK:
+                        self._work()
+        finally:
+            self._control.quit()
+            self._workshop.close()
+
+    def _restart(self) -> Turn:
+        command, config = self._control.take_restart()
+        plan = replace(self._plan, config=config, out=_beside(self._plan.out))
+        try:
+            if command.sequence is not None and command.sequence != plan.address:
+                opened = self._given.get(command.sequence) or self._open_sequence(command.sequence)
+                plan = replace(plan, sequence=opened, address=command.sequence, frames="")
+        except InputError as error:
+            self._control.begin(self._plan.config, 0, 0)
+            self._control.end()
+            self._fail(error)
+            return Turn.STOP
+        self._plan, self._resumed = plan, None
+        return self._one_run()
+
+    # ---- one run --------------------------------------------------------------------------------------------------
+
+    def _one_run(self) -> Turn:
+        """From the first frame to the summary; what ended it."""
+        self.error = self.summary = self._run = None
+        position = self._resumed.frame if self._resumed else 0
+        self._control.begin(self._plan.config, position, len(self._plan.sequence))
+        self._workshop.begin(lambda: self._control.quitting)
+        turn = Turn.STOP
+        try:
+            self._run = run = self._open_run()
+            self._show(run.state())
+            todo = range(position, len(self._plan.sequence))
+            frames = datasets.prefetch(self._plan.sequence, todo)
+            try:
+                turn = self._frames(run, frames)
+            finally:
+                frames.close()  # type: ignore[attr-defined]
+        except Exception as error:
+            self._fail(error)
+        self._control.end()
+        if self._run is not None:
+            self._end(self._run, turn)
+        return turn
+
+    def _open_run(self) -> Run:
+        plan = self._plan
+        if self._resumed is None:
+            folder = RunFolder.create(plan.out, self._not_saved)
+        else:
+            folder = RunFolder.reopen(plan.out, self._resumed.frame, self._not_saved)
+        return Run(plan, folder, self._feed.publish, self._make, self._checkpoint_every, self._resumed)
+
+    def _frames(self, run: Run, frames: Items) -> Turn:
+        """Step through the frames as the commands want it; what ended that (STOP also at the sequence's end)."""
+        from_here, last_step = threading.get_ident(), -1e9
+
+        def interrupt() -> None:
+            if self._control.leave_now:
+                raise Abandoned
+            if threading.get_ident() == from_here:
+                self._in_between(run)
+
+        while True:
+            run.clock.pause()
+            turn = self._control.next_turn(last_step)
+            run.clock.resume()
+            if turn is Turn.PAUSED:
+                run.measure()
+                self._show(State.PAUSED)
+            elif turn is Turn.WORK:
+                self._work()
+            elif turn is not Turn.STEP:
+                return turn
+            else:
+                last_step = monotonic()
+                item = next(frames, None)
+                if item is None:
+                    return Turn.STOP
+                self._step(run, item, interrupt)
+
+    def _step(self, run: Run, item: tuple[int, Frame | FrameError], interrupt: Callable[[], None]) -> None:
+        try:
+            report = run.feed(*item, interrupt)
+        except Abandoned:
+            return
+        self._control.stepped(run.tally.position, report is not None and report.loop is not None)
+        self._in_between(run)
+        self._workshop.keep(run)
+        if monotonic() >= self._next_snapshot:
+            self._show(run.state())
+
+    def _end(self, run: Run, turn: Turn) -> None:
+        """Final poses, mesh, summary. A restart or the end of the engine takes no time for mapping and meshing."""
+        complete = turn is Turn.STOP and self.error is None
+        try:
+            run.end(complete)
+            began = monotonic()
+            if complete:
+                self._workshop.final(run, self._control)
+            self.summary = run.close(monotonic() - began)
+        except Exception as error:
+            self._fail(error)
+        if complete and self.error is None:
+            self._show(State.FINISHED)
+
+    def _fail(self, error: Exception) -> None:
+        self.error = error
+        text = str(error) or type(error).__name__
+        if self._run is not None:
+            self._run.notice("error", text)
+            self._show(State.FAILED, text)
+        else:
+            self._feed.publish(Notice("error", text))
+
+    def _show(self, state: State, reason: str = "") -> None:
+        assert self._run is not None
+        self._next_snapshot = monotonic() + SNAPSHOT_PERIOD_S
+        snapshot = self._run.snapshot(state, reason)
+        self._feed.publish(snapshot)
+        self._progress(snapshot)
+
+    def _work(self) -> None:
+        """Take up what waits, at a frame boundary."""
+        run, orders = self._run, self._control.take_work()
+        if run is None:
+            self._feed.publish(Notice("error", "there is no run; restart it"))
+            return
+        for _, command in orders:
+            if isinstance(command, (Tune, LoadPreset)):
+                run.configure(self._control.config)
+                what = f"{command.key} = {command.value}" if isinstance(command, Tune) else f"preset {command.name}"
+                run.notice("info", f"{what} from frame {run.tally.position} on", run.tally.position)
+        self._workshop.take_up(run, orders)
+
+    def _in_between(self, run: Run) -> None:
+        """What can be done between frames and in the middle of a long mapping."""
+        self._workshop.take_up(run, self._control.take_work((RequestMesh,)))
+        self._workshop.live(run)
+
+    def _not_saved(self, text: str) -> None:
+        self._feed.publish(Notice("error", text))
+
+
+def _beside(folder: Path) -> Path:
+    """A folder that does not exist yet: ``runs/a`` -> ``runs/a-2`` -> ``runs/a-3``."""
+    stem, dash, number = folder.name.rpartition("-")
+    base = stem if dash and number.isdigit() else folder.name
+    count = 2
+    while (candidate := folder.with_name(f"{base}-{count}")).exists():
+        count += 1
+    return candidate

@@ -1,0 +1,97 @@
+"""What is taken away from a run in the dashboard: files in ``exports/``, named by the engine, and pictures."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+from .. import config as configuration
+from ..messages import Event, Export, Exported, FramePictures, Notice
+from ..types import InputError
+from .mesh_files import mesh_bytes
+from .meshjobs import FrozenMap, build_mesh
+from .pictures import shrink, shrink_depth, six_pictures
+from .poses import kitti_text, tum_text
+from .run import Run
+
+PICTURE_WIDTH = 160
+LEFT_OUT_OF_ZIP = ("checkpoints", "exports")
+
+
+def export_job(
+    run: Run,
+    export: Export,
+    command_id: int,
+    frozen: FrozenMap | None,
+    publish: Callable[[Event], None],
+    should_stop: Callable[[], bool],
+) -> Callable[[], None]:
+    """A job that writes the file and publishes ``Exported``. What it needs of the run is read now, in this thread."""
+    if export.kind == "run":
+        run.write_trajectory()
+    make = _maker(run, export, frozen, should_stop)
+    name = f"exports/{export.kind}-{max(run.tally.position - 1, 0):06d}{_ending(export)}"
+
+    def job() -> None:
+        path = zip_run(run.folder.path, name) if export.kind == "run" else run.folder.write(name, make())
+        if path is None:
+            publish(Notice("error", f"{export.kind} was not exported: {run.folder.not_saved.get(name, 'no file')}"))
+        else:
+            publish(Exported(export.kind, str(path), command_id))
+
+    return job
+
+
+def _ending(export: Export) -> str:
+    if export.kind == "mesh":
+        return f"-{1000 * export.voxel_m:g}mm.{export.format or 'ply'}"
+    return {"config": ".yaml", "run": ".zip"}.get(export.kind, f"-{export.format or 'tum'}.txt")
+
+
+def _maker(
+    run: Run, export: Export, frozen: FrozenMap | None, should_stop: Callable[[], bool]
+) -> Callable[[], str | bytes]:
+    if export.kind == "mesh":
+        assert frozen is not None
+        map_ = frozen
+        return lambda: mesh_bytes(build_mesh(map_, export.voxel_m, 0, should_stop).mesh, export.format or "ply")
+    if export.kind == "config":
+        text = configuration.to_yaml(run.config)
+        return lambda: text
+    times, poses = run.timestamps(), run.poses()
+    if export.kind == "keyframes":
+        kept = [run.tally.rows.index(frame) for frame in run.tally.keyframes]
+        times, poses = times[kept], poses[kept]
+    return (lambda: kitti_text(poses)) if export.format == "kitti" else (lambda: tum_text(times, poses))
+
+
+def zip_run(folder: Path, name: str) -> Path:
+    """The whole run folder but its checkpoints and exports, as ``name`` in it. Raises OSError."""
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    try:
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for file in sorted(folder.rglob("*")):
+                inside = file.relative_to(folder)
+                if file.is_file() and inside.parts[0] not in LEFT_OUT_OF_ZIP and not file.name.startswith("."):
+                    archive.write(file, Path(folder.name) / inside)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def render_pictures(run: Run, frame: int | None) -> FramePictures:
+    """The six pictures of a processed frame (None: the newest). Raises InputError."""
+    if run.slam is None or not run.tally.rows or run.slam.field is None:
+        raise InputError("there is no picture yet; wait for the first frame")
+    wanted = run.tally.rows[-1] if frame is None else frame
+    if wanted not in run.tally.rows:
+        raise InputError(f"frame {wanted} has not been processed; there are 0 .. {run.tally.rows[-1]}")
+    source = run.plan.sequence[wanted]
+    color, depth = shrink(source.color, PICTURE_WIDTH), shrink_depth(source.depth, PICTURE_WIDTH)
+    color_rendered, depth_rendered = run.slam.render(run.poses()[run.tally.rows.index(wanted)], depth)
+    return six_pictures(wanted, color, depth, color_rendered, depth_rendered)

@@ -1,0 +1,128 @@
+"""Files that survive a full disk and a kill at any moment: atomic replacement, and logs of one JSON object a line."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from ..types import InputError
+
+_TEMPORARY = ".tmp"
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Replace ``path`` by ``data``: whenever a crash comes, it holds either the old or the new bytes.
+
+    Raises OSError, with no temporary file left behind.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}{_TEMPORARY}")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in ``folder`` survive a power cut, where the system can do that."""
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Delete what interrupted ``write_atomic`` calls left in ``folder``."""
+    for path in folder.glob(f".*{_TEMPORARY}"):
+        path.unlink(missing_ok=True)
+
+
+def require_space(folder: Path, needed_mb: float) -> None:
+    """Create ``folder`` and make sure that it takes files and has space. Raises InputError when not."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(folder / "probe", b"writable")
+        (folder / "probe").unlink()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{folder}: cannot write there ({reason}); choose another folder with --out") from None
+    free_mb = shutil.disk_usage(folder).free / 1e6
+    if free_mb < needed_mb:
+        raise InputError(
+            f"{folder}: {free_mb:.0f} MB free, but a run may need {needed_mb:.0f} MB; make room or choose another --out"
+        )
+
+
+def to_json(value: Any) -> str:
+    """One line of JSON; numpy numbers and arrays become plain ones, NaN becomes null (JSON has no NaN)."""
+    return json.dumps(_plain(value), separators=(",", ":"), allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and value - value != 0:
+        return None
+    return value
+
+
+class LineLog:
+    """An append-only file with one JSON object a line. A line is written whole or not at all, also on a full disk."""
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+
+    def append(self, value: dict[str, Any]) -> None:
+        """Add one line. Raises OSError when it could not be written; the file is then as it was before."""
+        line = (to_json(value) + "\n").encode()
+        size = os.fstat(self._descriptor).st_size
+        try:
+            if os.write(self._descriptor, line) != len(line):
+                raise OSError(28, "No space left on device")
+        except OSError:
+            os.ftruncate(self._descriptor, size)
+            raise
+
+    def close(self) -> None:
+        """Flush to the disk and close."""
+        try:
+            os.fsync(self._descriptor)
+        finally:
+            os.close(self._descriptor)
+
+
+def read_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The objects of a ``LineLog``; a torn last line (killed while writing) is left out. A missing file is empty."""
+    if not path.is_file():
+        return
+    with open(path, encoding="utf-8", errors="replace") as file:
+        for line in file:
+            try:
+                value = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(value, dict):
+                yield value
+
+
+def keep_lines(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
+    """Drop the lines of a ``LineLog`` for which ``keep`` is False."""
+    if path.is_file():
+        kept = [to_json(value) + "\n" for value in read_lines(path) if keep(value)]
+        write_atomic(path, "".join(kept).encode())

@@ -1,0 +1,56 @@
+"""Small pictures for people: thumbnails and the six views of a frame."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..messages import FramePictures
+
+MAX_DIFFERENCE_M = 0.10
+
+
+def shrink(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """A colour image at most ``width`` pixels wide."""
+    if image.shape[1] <= width:
+        return image
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def shrink_depth(depth: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """A depth image at most ``width`` pixels wide; nearest pixels, so that no depth is made up."""
+    if depth.shape[1] <= width:
+        return depth
+    height = max(1, round(depth.shape[0] * width / depth.shape[1]))
+    return np.asarray(cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
+
+
+def six_pictures(
+    frame: int,
+    color: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    color_rendered: NDArray[np.uint8],
+    depth_rendered: NDArray[np.float32],
+) -> FramePictures:
+    """Input, rendered and difference, of colour [h, w, 3] and depth [h, w] (metres, 0 = none), all of one size."""
+    has = depth > 0
+    far = float(np.percentile(depth[has], 98)) if has.any() else 1.0
+    gap = np.where(has, np.abs(depth - depth_rendered), 0)
+    return FramePictures(
+        frame=frame,
+        color=color,
+        color_rendered=color_rendered,
+        color_difference=np.asarray(cv2.absdiff(color, color_rendered), np.uint8),
+        depth=_tinted(depth / far, has),
+        depth_rendered=_tinted(depth_rendered / far, depth_rendered > 0),
+        depth_difference=_tinted(gap / MAX_DIFFERENCE_M, has),
+    )
+
+
+def _tinted(share: NDArray[np.floating], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Values 0..1 as colours; black where there is none."""
+    level = (np.nan_to_num(share).clip(0, 1) * 255).astype(np.uint8)
+    tinted = np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_TURBO)[..., ::-1], np.uint8)
+    return np.where(valid[..., None], tinted, np.uint8(0))

@@ -1,0 +1,310 @@
+"""One pass over a sequence: frames in; poses, logs, checkpoints and a summary out. It knows no commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import config as configuration
+from ..config import Config
+from ..messages import Event, KeyframeView, LoopEvent, Notice, Snapshot, State, StepReport
+from ..types import Frame, FrameError, InputError, Sequence
+from .accuracy import Ate, ate, pose_error
+from .checkpoint import Checkpoint, CheckpointWriter
+from .driven import SlamFactory, SlamLike
+from .driven import State as Arrays
+from .meshjobs import FrozenMap
+from .pictures import shrink
+from .poses import tum_text
+from .runfolder import RunFolder
+from .summary import summarise
+from .tally import Stopwatch, Tally, peak_memory_mb
+
+ATE_EVERY = 10
+TRAJECTORY_EVERY = 100
+THUMBNAIL_WIDTH = 160
+PICTURE_WIDTH = 320
+NO_PICTURE = np.zeros((1, 1, 3), np.uint8)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run is to do. address: what ``open_sequence`` takes; frames: the ``A:B:STEP`` asked for, "" = all."""
+
+    config: Config
+    sequence: Sequence
+    address: str
+    frames: str
+    device: str
+    out: Path
+
+
+class Run:
+    """The state of one run. emit: takes events for the world. See the module."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        folder: RunFolder,
+        emit: Callable[[Event], None],
+        make: SlamFactory,
+        checkpoint_every: int,
+        resumed: Checkpoint | None = None,
+    ) -> None:
+        self.plan, self.folder, self.config = plan, folder, plan.config
+        self.slam: SlamLike | None = None
+        self.tally = Tally(**resumed.meta["tally"]) if resumed else Tally()
+        self.clock = Stopwatch(self.tally.wall_s)
+        self.truth = plan.sequence.poses_gt()
+        self.torn = False
+        self.report: StepReport | None = None
+        self.ate: Ate | None = None
+        self.loops: list[LoopEvent] = []
+        self._emit, self._make, self._checkpoint_every = emit, make, checkpoint_every
+        self._checkpoints = CheckpointWriter(
+            folder.path / "checkpoints",
+            failed=lambda error: folder.missing("checkpoints", error),
+            saved=lambda: folder.found("checkpoints"),
+        )
+        self._thumbnails: dict[int, NDArray[np.uint8]] = {}
+        self._picture: NDArray[np.uint8] | None = None
+        self._lost_for = 0
+        if resumed:
+            self._build(None, resumed.arrays)
+            self._thumbnails = folder.thumbnails()
+        else:
+            self._describe()
+
+    def _describe(self) -> None:
+        """Write what the run is about, before it begins."""
+        s, k = self.plan.sequence, self.plan.sequence.intrinsics
+        about: dict[str, Any] = {
+            "sequence": self.plan.address,
+            "name": s.name,
+            "layout": s.layout,
+            "frames": self.plan.frames,
+            "frames_total": len(s),
+            "device": self.plan.device,
+        }
+        about |= {name: getattr(k, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        self.folder.write("run.json", about)
+        self.folder.write("config.yaml", configuration.to_yaml(self.config))
+        if self.truth is not None:
+            known = np.isfinite(self.truth).all((1, 2))
+            self.folder.write("groundtruth.txt", tum_text(s.timestamps()[known], self.truth[known]))
+
+    # ---- frames ---------------------------------------------------------------------------------------------------
+
+    def feed(self, index: int, item: Frame | FrameError, interrupt: Callable[[], None]) -> StepReport | None:
+        """Process a frame, or skip it (None) when it is unreadable or does not move on in time.
+
+        Raises InputError when too many frames are unreadable, and whatever ``interrupt`` raises (the run is then
+        ``torn``: the frame at work is lost and there are no more checkpoints).
+        """
+        self.tally.position = index + 1
+        if isinstance(item, FrameError):
+            self.tally.unreadable.append(str(item))
+            self._skip(index, str(item))
+            return None
+        last = self.tally.last_timestamp
+        if last is not None and item.timestamp <= last:
+            way = "repeats" if item.timestamp == last else "goes back in"
+            self._skip(index, f"frame {index} {way} time ({item.timestamp:.6f} s after {last:.6f} s)")
+            return None
+        self._picture = shrink(item.color, PICTURE_WIDTH)
+        try:
+            report = self._step(item, interrupt)
+        except FrameError as error:
+            self._skip(index, str(error))
+            return None
+        except BaseException:
+            self.torn = True
+            self.tally.position = index
+            raise
+        self._record(report, item)
+        return report
+
+    def _step(self, frame: Frame, interrupt: Callable[[], None]) -> StepReport:
+        slam = self.slam or self._build(frame.c2w_gt, None)
+        report = slam.step(frame, interrupt)
+        if report.loop is None:
+            return report
+        return replace(report, loop=self._with_errors(report.loop, report.c2w))
+
+    def _build(self, first_pose: NDArray[np.float64] | None, state: Arrays | None) -> SlamLike:
+        sequence = self.plan.sequence
+        bounds = sequence.bounds if first_pose is not None else None
+        self.slam = self._make(
+            self.config, sequence.intrinsics, device=self.plan.device, bounds=bounds, first_pose=first_pose, state=state
+        )
+        return self.slam
+
+    def _with_errors(self, loop: LoopEvent, after: NDArray[np.float64]) -> LoopEvent:
+        truth = None if self.truth is None else self.truth[loop.frame]
+        if truth is None or loop.c2w_before is None or not np.isfinite(truth).all():
+            return loop
+        (cm_before, deg_before), (cm_after, deg_after) = pose_error(loop.c2w_before, truth), pose_error(after, truth)
+        return replace(
+            loop,
+            error_before_cm=cm_before,
+            error_after_cm=cm_after,
+            rotation_error_before_deg=deg_before,
+            rotation_error_after_deg=deg_after,
+        )
+
+    def _skip(self, index: int, why: str) -> None:
+        self.tally.skipped += 1
+        self.notice("warning", f"skipped: {why}", index)
+        if self.tally.too_many_unreadable:
+            bad = self.tally.unreadable
+            raise InputError(
+                f"{self.plan.address}: {len(bad)} of {self.tally.position} frames cannot be read, the first being "
+                f"{bad[0]}; look at it with: ecslam check"
+            )
+
+    def _record(self, report: StepReport, frame: Frame) -> None:
+        self.tally.add(report)
+        self.report = report
+        self._lost_for = self._lost_for + 1 if report.lost else 0
+        if len(self.tally.rows) % ATE_EVERY == 0:
+            self.measure()
+        if report.is_keyframe:
+            self._thumbnails[report.frame] = shrink(frame.color, THUMBNAIL_WIDTH)
+            self.folder.keyframe(report.frame, report.c2w, self._thumbnails[report.frame])
+        self.folder.metrics(report, self.ate.rmse_cm if self.ate else None)
+        if report.loop is not None:
+            self.loops.append(report.loop)
+            self.folder.event(report.loop)
+            self._emit(report.loop)
+        if report.note:
+            self.notice("warning" if report.lost else "info", report.note, report.frame)
+        if len(self.tally.rows) == 1 or self.tally.position % self._checkpoint_every == 0:
+            self.checkpoint()
+        if len(self.tally.rows) % TRAJECTORY_EVERY == 0:
+            self.write_trajectory()
+
+    def configure(self, config: Config) -> None:
+        """Other tracking and mapping settings from the next frame on."""
+        self.config = config
+        if self.slam is not None:
+            self.slam.configure(config)
+
+    def notice(self, level: str, text: str, frame: int | None = None) -> None:
+        """Tell the world something, and the log."""
+        notice = Notice(level, text, frame)
+        self.folder.event(notice)
+        self._emit(notice)
+
+    # ---- what there is so far ---------------------------------------------------------------------------------------
+
+    def poses(self) -> NDArray[np.float64]:
+        """Poses [n, 4, 4] of the processed frames; the frame of a torn step is left out."""
+        if self.slam is None:
+            return np.empty((0, 4, 4))
+        return self.slam.trajectory.poses()[: len(self.tally.rows)]
+
+    def timestamps(self) -> NDArray[np.float64]:
+        """[n] seconds of the processed frames."""
+        return np.array(self.slam.trajectory.timestamps[: len(self.tally.rows)] if self.slam else [], np.float64)
+
+    def measure(self) -> None:
+        """Bring the ATE up to date."""
+        self.ate = None if self.truth is None else ate(self.poses(), self.truth[self.tally.rows])
+
+    def freeze(self) -> FrozenMap | None:
+        """The map as it is now, for the job thread; None before there is one."""
+        if self.slam is None or self.slam.field is None:
+            return None
+        sdf, color = self.slam.query()
+        return FrozenMap(max(self.tally.position - 1, 0), sdf, color, self.slam.surface_points())
+
+    def keyframe_poses(self) -> tuple[list[int], NDArray[np.float64]]:
+        """Frame indices and poses [k, 4, 4] of the keyframes."""
+        poses, frames = self.poses(), self.tally.keyframes
+        return frames, poses[np.searchsorted(self.tally.rows, frames)]
+
+    def state(self) -> State:
+        """What the engine is doing, from the last frame."""
+        if self.report is None:
+            return State.INITIALISING
+        if self._lost_for:
+            return State.LOST if self._lost_for == 1 else State.RELOCALISING
+        return State.MAPPING if self.report.window else State.TRACKING
+
+    def snapshot(self, state: State, reason: str = "") -> Snapshot:
+        """Everything visible."""
+        sequence, camera, report = self.plan.sequence, self.plan.sequence.intrinsics, self.report
+        poses = self.poses()
+        rows = self.tally.row_of_each_frame() if len(poses) else np.zeros(0, np.int64)
+        frames, keyframe_poses = self.keyframe_poses()
+        seconds = self.clock.seconds
+        return Snapshot(
+            state=state,
+            sequence=sequence.name,
+            preset=self.config.preset,
+            frame=max(self.tally.position - 1, 0),
+            frames_total=len(sequence),
+            trajectory=poses[rows],
+            trajectory_gt=self.truth,
+            keyframes=tuple(
+                map(KeyframeView, frames, keyframe_poses, (self._thumbnails.get(f, NO_PICTURE) for f in frames))
+            ),
+            window=report.window if report else (),
+            color=self._picture,
+            fov_y_rad=2 * float(np.arctan(camera.height / (2 * camera.fy))),
+            aspect=camera.width / camera.height,
+            losses=report.losses if report else {},
+            track_ms=report.track_ms if report else 0.0,
+            map_ms=report.map_ms if report else 0.0,
+            fps_wall=len(self.tally.rows) / seconds if seconds else 0.0,
+            fps_engine=self.tally.fps_engine,
+            ate_cm=self.ate.rmse_cm if self.ate else None,
+            memory_mb=peak_memory_mb(),
+            loops=tuple(self.loops),
+            skipped=self.tally.skipped,
+            lost_frames=self.tally.lost,
+            reason=reason,
+        )
+
+    # ---- saving -----------------------------------------------------------------------------------------------------
+
+    def checkpoint(self, finished: bool = False) -> None:
+        """Start saving everything that ``resume`` needs."""
+        if self.slam is None or self.torn:
+            return
+        self.tally.wall_s = self.clock.seconds
+        meta = {
+            "sequence": self.plan.address,
+            "frames": self.plan.frames,
+            "config": configuration.to_dict(self.config),
+            "tally": self.tally.to_json(),
+            "finished": finished,
+        }
+        self._checkpoints.save(Checkpoint(self.tally.position, self.slam.state(), meta))
+
+    def write_trajectory(self) -> None:
+        """Bring ``trajectory.txt`` up to date."""
+        self.folder.write("trajectory.txt", tum_text(self.timestamps(), self.poses()))
+
+    def end(self, complete: bool) -> None:
+        """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock."""
+        if complete and self.slam is not None and self.tally.rows and not self.torn:
+            self.slam.finish()
+        self.clock.pause()
+        self.tally.wall_s = self.clock.seconds
+        self.measure()
+        self.write_trajectory()
+        self.checkpoint(finished=complete)
+        self._checkpoints.wait()
+
+    def close(self, export_s: float) -> dict[str, Any]:
+        """Write ``summary.json`` and close the logs; the summary comes back. ``end`` has been called before."""
+        summary = summarise(self, export_s)
+        self.folder.write("summary.json", summary)
+        self.folder.close()
+        return summary

@@ -1,0 +1,159 @@
+"""The folder that a run leaves behind: what a person, ``ecslam view`` or ``ecslam resume`` needs, in plain formats.
+
+run.json         sequence (address), name, layout, frames (the A:B:STEP asked for), frames_total, device, width, height,
+                 fx, fy, cx, cy
+config.yaml      the resolved configuration
+trajectory.txt   TUM format (timestamp tx ty tz qx qy qz qw), final poses, one line for each frame that was processed
+groundtruth.txt  the same for the frames that have ground truth; absent without any
+metrics.jsonl    a line for each frame, as it was then: frame, timestamp, c2w (12 numbers, the upper 3x4 row by row),
+                 tracked, lost, keyframe, window, losses, track_ms, map_ms, ate_cm
+events.jsonl     type is "loop" (with the fields of LoopEvent) or "notice" (level, text, frame)
+keyframes.jsonl  frame, c2w (12 numbers, when it was made), thumbnail (relative path)
+thumbnails/      NNNNNN.jpg, at most 160 pixels wide, by frame
+meshes/          NNNNNN.ply, a few meshes of the growing map, by frame
+mesh.ply         the final mesh
+summary.json     the figures
+checkpoints/     see checkpoint.py
+exports/         what was asked for in the dashboard
+
+Whole files are replaced atomically, logs grow by whole lines. When the disk is full the run goes on, and ``not_saved``
+says what is missing, and why.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..messages import LoopEvent, Notice, StepReport
+from ..types import InputError
+from .files import LineLog, keep_lines, read_lines, remove_temporaries, require_space, to_json, write_atomic
+
+NEEDED_MB = 500.0
+LOGS = ("metrics.jsonl", "events.jsonl", "keyframes.jsonl")
+FILES = ("run.json", "config.yaml", "trajectory.txt", "groundtruth.txt", "mesh.ply", "summary.json")
+FOLDERS = ("thumbnails", "meshes", "checkpoints")
+
+
+class RunFolder:
+    """Writes a run folder. problem: called once for each file that could not be saved, with a sentence for people."""
+
+    def __init__(self, path: Path, problem: Callable[[str], None]) -> None:
+        self.path = path
+        self.not_saved: dict[str, str] = {}
+        self._problem = problem
+        for name in ("thumbnails", "meshes"):
+            (path / name).mkdir(exist_ok=True)
+        self._logs = {name: LineLog(path / name) for name in LOGS}
+
+    @classmethod
+    def create(cls, path: Path, problem: Callable[[str], None], needed_mb: float = NEEDED_MB) -> RunFolder:
+        """Start a run in ``path``; an earlier run there is replaced.
+
+        Raises InputError when the folder takes no files, has too little space, or holds something else than a run.
+        """
+        foreign = path.is_dir() and any(not p.name.startswith(".") for p in path.iterdir())
+        if foreign and not any((path / name).is_file() for name in (*FILES, *LOGS)):
+            raise InputError(f"{path}: holds other files and no run; give --out a new or empty folder")
+        require_space(path, needed_mb)
+        for name in (*FILES, *LOGS):
+            (path / name).unlink(missing_ok=True)
+        for name in FOLDERS:
+            shutil.rmtree(path / name, ignore_errors=True)
+        return cls(path, problem)
+
+    @classmethod
+    def reopen(cls, path: Path, position: int, problem: Callable[[str], None]) -> RunFolder:
+        """Go on in ``path`` from frame ``position``: what was logged for it and later frames is dropped."""
+        require_space(path, NEEDED_MB)
+        remove_temporaries(path)
+        for name in LOGS:
+            keep_lines(path / name, lambda line: (line.get("frame") or 0) < position)
+        return cls(path, problem)
+
+    def write(self, name: str, data: str | bytes | dict[str, Any]) -> Path | None:
+        """Replace a file (a dict becomes JSON); None when it could not be saved."""
+        content = to_json(data) + "\n" if isinstance(data, dict) else data
+        path = self.path / name
+        try:
+            path.parent.mkdir(exist_ok=True)
+            write_atomic(path, content.encode() if isinstance(content, str) else content)
+        except OSError as error:
+            self.missing(name, error)
+            return None
+        self.found(name)
+        return path
+
+    def missing(self, name: str, error: OSError) -> None:
+        """Note that ``name`` could not be saved, and say so the first time."""
+        reason = error.strerror or str(error)
+        known = name in self.not_saved
+        self.not_saved[name] = reason
+        if not known:
+            self._problem(f"{self.path / name} could not be saved ({reason}); the run goes on without it")
+
+    def found(self, name: str) -> None:
+        """Note that ``name`` is saved after all."""
+        self.not_saved.pop(name, None)
+
+    def metrics(self, report: StepReport, ate_cm: float | None) -> None:
+        """Log what a frame brought."""
+        line = {
+            "frame": report.frame,
+            "timestamp": report.timestamp,
+            "c2w": report.c2w[:3].reshape(-1),
+            "tracked": report.tracked,
+            "lost": report.lost,
+            "keyframe": report.is_keyframe,
+            "window": report.window,
+            "losses": report.losses,
+            "track_ms": report.track_ms,
+            "map_ms": report.map_ms,
+            "ate_cm": ate_cm,
+        }
+        self._append("metrics.jsonl", line)
+
+    def event(self, event: LoopEvent | Notice) -> None:
+        """Log an event."""
+        kind = "loop" if isinstance(event, LoopEvent) else "notice"
+        self._append("events.jsonl", {"type": kind} | {f.name: getattr(event, f.name) for f in fields(event)})
+
+    def keyframe(self, frame: int, c2w: NDArray[np.float64], thumbnail: NDArray[np.uint8]) -> None:
+        """Log a keyframe and save its picture, uint8 [h, w, 3] RGB."""
+        name = f"thumbnails/{frame:06d}.jpg"
+        done, jpeg = cv2.imencode(".jpg", thumbnail[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+        if done:
+            self.write(name, jpeg.tobytes())
+        self._append("keyframes.jsonl", {"frame": frame, "c2w": c2w[:3].reshape(-1), "thumbnail": name})
+
+    def thumbnails(self) -> dict[int, NDArray[np.uint8]]:
+        """The saved keyframe pictures, by frame; black where one is not readable."""
+        found = {}
+        for line in read_lines(self.path / "keyframes.jsonl"):
+            image = cv2.imread(str(self.path / line["thumbnail"]))
+            black = np.zeros((1, 1, 3), np.uint8)
+            found[int(line["frame"])] = black if image is None else np.asarray(image[..., ::-1], np.uint8)
+        return found
+
+    def _append(self, name: str, line: dict[str, Any]) -> None:
+        try:
+            if name in self._logs:
+                self._logs[name].append(line)
+        except OSError as error:
+            self.missing(name, error)
+
+    def close(self) -> None:
+        """Bring the logs to the disk; what is logged later is dropped. May be called more than once."""
+        while self._logs:
+            name, log = self._logs.popitem()
+            try:
+                log.close()
+            except OSError as error:
+                self.missing(name, error)

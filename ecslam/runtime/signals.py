@@ -1,0 +1,39 @@
+"""Ctrl-C and SIGTERM: the first asks the engine to save and stop, the second quits at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from ..messages import Quit
+from .protocol import EngineHandle
+
+
+@contextmanager
+def quit_on_signals(engine: EngineHandle) -> Iterator[None]:
+    """Within the block, SIGINT and SIGTERM submit ``Quit``; a second one ends the process with 128 + its number.
+
+    Call it in the main thread.
+    """
+    asked = False
+
+    def handle(number: int, _: FrameType | None) -> None:
+        nonlocal asked
+        if asked:
+            os._exit(128 + number)
+        asked = True
+        print("stopping after this frame and saving; once more quits at once", file=sys.stderr, flush=True)
+        # In a thread of its own: the interrupted code may hold the lock that submit takes.
+        threading.Thread(target=engine.submit, args=(Quit(),), daemon=True).start()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

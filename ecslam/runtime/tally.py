@@ -1,0 +1,99 @@
+"""What a run counts and times: the figures of its progress line and of ``summary.json``."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from dataclasses import asdict, dataclass, field
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from ..messages import StepReport
+
+UNREADABLE_SHARE = 0.20
+UNREADABLE_AFTER = 10
+
+
+@dataclass
+class Tally:
+    """Counters that survive a checkpoint.
+
+    position: frames of the sequence done, skipped ones included. rows: frame index of each pose of the trajectory.
+    unreadable: a sentence for each frame that could not be read. wall_s: seconds spent, pauses left out. engine_ms:
+    tracking and mapping without the first frame (its initialisation), as Co-SLAM counts.
+    """
+
+    position: int = 0
+    rows: list[int] = field(default_factory=list)
+    keyframes: list[int] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+    skipped: int = 0
+    lost: int = 0
+    loops: int = 0
+    wall_s: float = 0.0
+    engine_ms: float = 0.0
+    last_timestamp: float | None = None
+
+    def add(self, report: StepReport) -> None:
+        """Count a frame that was processed."""
+        if self.rows:
+            self.engine_ms += report.track_ms + report.map_ms
+        self.rows.append(report.frame)
+        self.lost += report.lost
+        self.loops += report.loop is not None
+        self.last_timestamp = report.timestamp
+        if report.is_keyframe:
+            self.keyframes.append(report.frame)
+
+    @property
+    def too_many_unreadable(self) -> bool:
+        """Whether the run is not worth going on with."""
+        return self.position >= UNREADABLE_AFTER and len(self.unreadable) > UNREADABLE_SHARE * self.position
+
+    @property
+    def fps_wall(self) -> float:
+        """Frames per second with everything: reading, tracking, mapping, checkpoints."""
+        return len(self.rows) / self.wall_s if self.wall_s > 0 else 0.0
+
+    @property
+    def fps_engine(self) -> float:
+        """Frames per second of tracking and mapping alone."""
+        return 1e3 * (len(self.rows) - 1) / self.engine_ms if self.engine_ms > 0 else 0.0
+
+    def row_of_each_frame(self) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """[position] for every frame so far the row of the trajectory that holds its pose or the last one before it."""
+        rows = np.searchsorted(np.array(self.rows, np.int64), np.arange(self.position), side="right") - 1
+        return rows.clip(0)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+class Stopwatch:
+    """Seconds since ``start``, without those between ``pause`` and ``resume``."""
+
+    def __init__(self, already_s: float = 0.0) -> None:
+        self._total_s = already_s
+        self._since: float | None = monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """The time so far."""
+        return self._total_s + (monotonic() - self._since if self._since is not None else 0.0)
+
+    def pause(self) -> None:
+        """Stop counting."""
+        self._total_s, self._since = self.seconds, None
+
+    def resume(self) -> None:
+        """Count again."""
+        self._total_s, self._since = self.seconds, monotonic()
+
+
+def peak_memory_mb() -> float:
+    """The most memory this process has had so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1024

@@ -1,0 +1,119 @@
+"""Meshes, pictures and exports for the world: what is needed is frozen on the engine thread, made by the job thread."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from ..messages import Command, Export, Notice, RequestMesh, RequestPictures
+from ..types import InputError
+from .control import Control
+from .exports import export_job, render_pictures
+from .feed import Feed
+from .mesh_files import ply_bytes
+from .meshjobs import FrozenMap, JobThread, LiveMeshes, build_mesh
+from .run import Run
+
+MESHES_KEPT = 8
+KEPT_VOXEL_M = 0.05
+KEPT_TRIANGLES = 60_000
+FINEST_VOXEL_M = 0.01
+
+
+class Workshop:
+    """Owns the job thread. All methods but ``waiting`` are called on the engine thread."""
+
+    def __init__(self, feed: Feed) -> None:
+        self._feed = feed
+        self._jobs = JobThread(lambda error: self._complain(f"a mesh or an export failed: {error}"))
+        self._live = LiveMeshes()
+        self._leaving: Callable[[], bool] = lambda: False
+
+    @property
+    def waiting(self) -> int:
+        """Jobs that are not done yet."""
+        return self._jobs.waiting
+
+    def begin(self, leaving: Callable[[], bool]) -> None:
+        """A run begins; jobs end early when ``leaving`` answers True."""
+        self._live = LiveMeshes()
+        self._leaving = leaving
+
+    def close(self) -> None:
+        """Drop what waits and end the job thread."""
+        self._jobs.close()
+
+    def take_up(self, run: Run, orders: list[tuple[int, Command]]) -> None:
+        """Begin what was ordered; orders taken up together share one frozen map."""
+        frozen: FrozenMap | None = None
+        for command_id, command in orders:
+            try:
+                if isinstance(command, RequestPictures):
+                    self._feed.publish(render_pictures(run, command.frame))
+                    continue
+                if isinstance(command, RequestMesh) or (isinstance(command, Export) and command.kind == "mesh"):
+                    frozen = frozen or _freeze(run)
+                if isinstance(command, RequestMesh):
+                    self._jobs.submit(self._mesh_job(_needed(frozen), command))
+                elif isinstance(command, Export):
+                    self._jobs.submit(export_job(run, command, command_id, frozen, self._feed.publish, self._leaving))
+            except (InputError, OSError) as error:
+                self._complain(str(error))
+
+    def _mesh_job(self, frozen: FrozenMap, order: RequestMesh) -> Callable[[], None]:
+        return lambda: self._feed.publish(build_mesh(frozen, order.voxel_m, order.max_triangles, self._leaving))
+
+    def live(self, run: Run, at_once: bool = False) -> None:
+        """The periodic mesh, when somebody watches and it is due."""
+        frozen = run.freeze() if self._feed.watched and (at_once or self._live.due) else None
+        if frozen is not None:
+            self._live.begin()
+            self._jobs.submit(lambda: self._make_live(self._live, frozen))
+
+    def _make_live(self, live: LiveMeshes, frozen: FrozenMap) -> None:
+        ready = live.make(frozen, self._leaving)
+        if ready is not None:
+            self._feed.publish(ready)
+
+    def keep(self, run: Run) -> None:
+        """A few meshes over the run, for looking back later."""
+        if run.tally.position % -(-len(run.plan.sequence) // MESHES_KEPT) == 0:
+            frozen = run.freeze()
+            if frozen is not None:
+                name = f"meshes/{frozen.frame:06d}.ply"
+                self._jobs.submit(lambda: self._save(run, name, frozen, KEPT_VOXEL_M, KEPT_TRIANGLES))
+
+    def final(self, run: Run, control: Control) -> None:
+        """``mesh.ply`` at the map's finest voxel; given up when the engine is asked to leave."""
+        frozen, done = run.freeze(), threading.Event()
+        if frozen is None:
+            return
+
+        def job() -> None:
+            try:
+                self._save(run, "mesh.ply", frozen, max(run.config.field.finest_voxel_m, FINEST_VOXEL_M), 0)
+            finally:
+                done.set()
+                control.wake()
+
+        self.live(run, at_once=True)
+        self._jobs.submit(job)
+        if not control.wait_for(done.is_set):
+            run.notice("warning", f"left before mesh.ply was made; make it with: ecslam mesh {run.folder.path}")
+
+    def _save(self, run: Run, name: str, frozen: FrozenMap, voxel_m: float, max_triangles: int) -> None:
+        mesh = build_mesh(frozen, voxel_m, max_triangles, self._leaving).mesh
+        run.folder.write(name, ply_bytes(mesh))
+
+    def _complain(self, text: str) -> None:
+        self._feed.publish(Notice("error", text))
+
+
+def _freeze(run: Run) -> FrozenMap:
+    return _needed(run.freeze())
+
+
+def _needed(frozen: FrozenMap | None) -> FrozenMap:
+    if frozen is None:
+        raise InputError("there is no map yet; wait for the first frame")
+    return frozen
