@@ -10,7 +10,12 @@ from ..messages import Ack, Command, Event, Snapshot
 
 @runtime_checkable
 class Subscription(Protocol):
-    """One reader's view of the feed. Snapshots are newest-wins; events and acknowledgements are never dropped."""
+    """One reader's view of the feed. Snapshots are newest-wins; events and acknowledgements are never dropped.
+
+    overrun: the reader was too slow and the subscription has ended; it may subscribe again.
+    """
+
+    overrun: bool
 
     def get(self, timeout: float | None = None) -> Snapshot | Event | Ack | None:
         """The next message; waits at most ``timeout`` seconds (None: for ever). None on time-out and after close."""

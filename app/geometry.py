@@ -1,0 +1,83 @@
+"""Pure numpy geometry for drawing: lines, frusta, quaternions, a sensible first view."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser.transforms as vt
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def wxyz(c2w: Array) -> Array:
+    """Unit quaternions [..., 4] of poses [..., 4, 4]."""
+    return np.asarray(vt.SO3.from_matrix(c2w[..., :3, :3]).wxyz)
+
+
+def rotation_difference_deg(a: Array, b: Array) -> Array:
+    """Angle in degrees between the rotations of poses [n, 4, 4]; NaN where either is NaN."""
+    r = np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]
+    vee = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], 1)
+    return np.degrees(np.arctan2(np.linalg.norm(vee, axis=1), np.trace(r, axis1=1, axis2=2) - 1))
+
+
+def polyline(points: Array, most: int = 2000) -> NDArray[np.float32]:
+    """[n, 3] -> segments [m, 2, 3] joining successive finite points, thinned to about ``most`` of them."""
+    points = points[np.linspace(0, len(points) - 1, min(len(points), most)).round().astype(int)]
+    segments = np.stack([points[:-1], points[1:]], 1) if len(points) > 1 else np.zeros((0, 2, 3))
+    return segments[np.isfinite(segments).all((1, 2))].astype(np.float32)
+
+
+def frustum_corners(fov_y: float, aspect: float, scale: float) -> Array:
+    """Apex and four image corners [5, 3] of a camera frustum, OpenCV axes, ``scale`` metres deep."""
+    h = np.tan(fov_y / 2) * scale
+    w = h * aspect
+    return np.array([[0, 0, 0], [-w, -h, scale], [w, -h, scale], [w, h, scale], [-w, h, scale]])
+
+
+FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+FRUSTUM_FACES = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]], np.uint32)
+
+
+def frustum_lines(c2w: Array, fov_y: float, aspect: float, scale: float) -> NDArray[np.float32]:
+    """Edges [n * 8, 2, 3] of the frusta of poses [n, 4, 4]."""
+    corners = frustum_corners(fov_y, aspect, scale)
+    world = np.einsum("nij,kj->nki", c2w[:, :3, :3], corners) + c2w[:, None, :3, 3]
+    return world[:, FRUSTUM_EDGES].reshape(-1, 2, 3).astype(np.float32)
+
+
+def up_direction(c2w: Array) -> Array:
+    """World up [3] as the cameras' mean up vector, snapped to an axis that lies within 30 degrees."""
+    good = c2w[np.isfinite(c2w).all((1, 2))]
+    mean = -good[:, :3, 1].mean(0) if len(good) else np.array([0.0, 0.0, 1.0])
+    length = np.linalg.norm(mean)
+    mean = mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    axis = np.zeros(3)
+    axis[np.argmax(np.abs(mean))] = np.sign(mean[np.argmax(np.abs(mean))])
+    return axis if axis @ mean > np.cos(np.radians(30)) else mean
+
+
+def rotation_to(up: Array) -> Array:
+    """Quaternion [4] that turns +z into the unit vector ``up``."""
+    axis = np.cross([0.0, 0.0, 1.0], up)
+    if np.linalg.norm(axis) < 1e-9:
+        axis = np.array([1.0, 0.0, 0.0])
+    axis *= np.arccos(np.clip(up[2], -1, 1)) / np.linalg.norm(axis)
+    return np.asarray(vt.SO3.exp(axis).wxyz)
+
+
+def overview(low: Array, high: Array, up: Array, aspect: float, fov_y: float) -> tuple[Array, Array]:
+    """Position and look-at point from which the box low..high is seen whole, obliquely from above."""
+    centre = (low + high) / 2
+    side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
+    side /= np.linalg.norm(side)
+    away = 0.52 * side + 0.33 * np.cross(up, side) + 0.79 * up
+    radius = max(float(np.linalg.norm(high - low)) / 2, 0.5)
+    half = np.arctan(np.tan(fov_y / 2) * min(1.0, aspect))
+    return centre + away / np.linalg.norm(away) * radius / np.sin(half) * 0.82, centre
+
+
+def behind(c2w: Array, up: Array, distance: float = 1.1) -> tuple[Array, Array]:
+    """A viewing position just behind and above a camera, and the point it looks at."""
+    centre, forward = c2w[:3, 3], c2w[:3, 2]
+    return centre - distance * forward + 0.45 * distance * up, centre + 1.5 * forward

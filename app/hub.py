@@ -1,0 +1,280 @@
+"""The one thread that owns the page: it takes snapshots, events and clicks from an inbox and updates scene and panels.
+
+Browser callbacks write nothing. They either submit a command to the engine at once or post an action here.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import viser
+from ecslam.messages import Ack, Command, Event, Export, Exported, LoopEvent, MeshReady, Notice, RequestMesh, Snapshot, State
+from ecslam.runtime.protocol import EngineHandle
+
+from . import theme
+from .glb import TRIANGLE_BUDGET
+from .history import History
+from .panel import TABS, BasePanel, find_panels
+from .replay import ReplayEngine
+from .scene import Scene
+
+log = logging.getLogger(__name__)
+
+REFRESH_S = 0.12
+MESH_EVERY_S = 1.5
+DOWNLOAD_LIMIT = 256 * 1024 * 1024
+
+
+class Hub:
+    """Connects an engine to a viser server. ``start`` builds the page, ``close`` ends it."""
+
+    def __init__(self, engine: EngineHandle, server: viser.ViserServer, dark: bool) -> None:
+        self.engine, self.server, self.dark = engine, server, dark
+        self.scene = Scene(server, self._keyframe_clicked)
+        self.replay = engine if isinstance(engine, ReplayEngine) else None
+        self.history = History() if self.replay is None else self.replay.history
+        self.current: Snapshot | None = None
+        self.follow = False
+        self.mesh_voxel_m, self.mesh_wanted = 0.04, True
+        self.jobs = ThreadPoolExecutor(2, "dashboard-job")
+        self._askers: dict[int, viser.ClientHandle] = {}
+        self._asking = threading.Lock()
+        self._inbox: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._subscription = engine.subscribe()
+        self._newest: Snapshot | None = None
+        self._newest_lock = threading.Lock()
+        self._mesh_asked, self._mesh_pending, self._mesh_frame = 0.0, False, -1
+        self._seen_mesh = False
+        self._closing = False
+        self.panels: list[BasePanel] = []
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._listen, self._work)]
+
+    # ---- life ----------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Build the panels and begin to show."""
+        self.theme()
+        self.server.gui.main_panel.dock_right()
+        self.server.gui.main_panel.set_width(372)
+        found = [panel for panel in find_panels() if panel.applies(self)]
+        self.panels += [panel(self) for panel in found if not panel.tab]
+        group = self.server.gui.add_tab_group()
+        for tab in TABS:
+            members = [panel for panel in found if panel.tab == tab]
+            if members:
+                with group.add_tab(tab):
+                    self.panels += [panel(self) for panel in members]
+        self.server.on_client_connect(self._connected)
+        latest = self.engine.latest()
+        if latest is not None:
+            self._take(latest)
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """Stop showing; the engine goes on."""
+        self._closing = True
+        self._subscription.close()
+        self._inbox.put(None)
+        self.jobs.shutdown(wait=False, cancel_futures=True)
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(3)
+
+    def theme(self) -> None:
+        """Send colours and layout to the browsers."""
+        self.server.gui.configure_theme(
+            dark_mode=self.dark,
+            show_logo=False,
+            show_share_button=False,
+            control_width="large",
+            brand_color=theme.ACCENT,
+        )
+
+    # ---- what panels use -----------------------------------------------------------------------------------------
+
+    def post(self, action: Callable[[], Any]) -> None:
+        """Run ``action`` on the hub's thread, soon."""
+        self._inbox.put(action)
+
+    def submit(self, command: Command, client: viser.ClientHandle | None = None) -> int:
+        """Send a command to the engine; ``client`` gets the toast about what became of it."""
+        with self._asking:
+            number = self.engine.submit(command)
+            if client is not None:
+                self._askers[number] = client
+        return number
+
+    def commands(self, button: Any, make: Callable[[], Command]) -> None:
+        """Let a button submit what ``make`` builds, on the event loop, without waiting for anything."""
+
+        @button.on_click
+        async def _(event: Any) -> None:
+            self.submit(make(), event.client)
+
+    def on(self, handle: Any, action: Callable[[Any], Any]) -> None:
+        """Run ``action(event)`` on the hub's thread when a browser changes or clicks a control."""
+        register = handle.on_click if hasattr(handle, "on_click") else handle.on_update
+
+        @register
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self.post(partial(action, event))
+
+    def viewers(self) -> Iterable[viser.ClientHandle]:
+        """The connected browsers."""
+        return self.server.get_clients().values()
+
+    def toast(self, title: str, text: str, color: str, client: viser.ClientHandle | None = None) -> None:
+        """Tell one viewer something, or all of them."""
+        for viewer in [client] if client is not None else self.viewers():
+            viewer.add_notification(title, text, auto_close_seconds=8.0, color=color)  # type: ignore[call-overload]
+
+    def deliver(self, client: viser.ClientHandle | None, path: Path) -> None:
+        """Say where a file lies and start its download in the browser of who asked for it."""
+        size = path.stat().st_size
+        text = f"{path}  ({size / 1e6:.1f} MB)"
+        if client is None:
+            return
+        if size > DOWNLOAD_LIMIT:
+            self.toast("Saved", f"{text}; too large to download here", "yellow", client)
+            return
+        client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
+        self.toast("Saved", text, "green", client)
+
+    def remesh(self) -> None:
+        """Ask for a fresh mesh at the next chance, whatever the clock says."""
+        self._mesh_asked, self._mesh_frame = 0.0, -1
+
+    # ---- the two threads -----------------------------------------------------------------------------------------
+
+    def _listen(self) -> None:
+        while not self._closing:
+            message = self._subscription.get(1.0)
+            if self._subscription.overrun:
+                self._subscription = self.engine.subscribe()
+            if isinstance(message, Snapshot):
+                self._take(message)
+            elif message is not None:
+                self.post(partial(self._tell, message))
+
+    def _take(self, s: Snapshot) -> None:
+        with self._newest_lock:
+            fresh, self._newest = self._newest is None, s
+        if fresh:
+            self.post(self._wake)
+
+    def _work(self) -> None:
+        shown, show_at = 0.0, None
+        while True:
+            try:
+                wait = None if show_at is None else max(0.0, show_at - time.monotonic())
+                action = self._inbox.get(timeout=wait)
+            except queue.Empty:
+                shown, show_at = time.monotonic(), None
+                self._attempt(self._show)
+                continue
+            if action is None:
+                return
+            if action == self._wake:
+                show_at = show_at or max(time.monotonic(), shown + REFRESH_S)
+            else:
+                self._attempt(action)
+
+    def _wake(self) -> None:
+        """Posted when a snapshot waits; the worker shows it when the page may be refreshed again."""
+
+    def _attempt(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except Exception:
+            log.exception("the dashboard could not carry out %r", action)
+
+    def _show(self) -> None:
+        with self._newest_lock:
+            s, self._newest = self._newest, None
+        if s is None:
+            return
+        before, self.current = self.current, s
+        restarted = before is not None and s.frame < before.frame and self.replay is None
+        if before is None or restarted or before.sequence != s.sequence:
+            self._begin(s)
+        self.history.add_snapshot(s)
+        self.scene.update(s)
+        for panel in self.panels:
+            panel.snapshot(s)
+        if self.follow and len(s.trajectory):
+            for client in self.viewers():
+                self.scene.follow(client, s.trajectory[-1])
+        self._want_mesh(s)
+
+    def _begin(self, s: Snapshot) -> None:
+        if self.replay is None:
+            self.history = History()
+        self.scene.begin(s)
+        self._seen_mesh, self._mesh_frame = False, -1
+        for client in self.viewers():
+            self.scene.show_all(client, 0.0)
+
+    def _want_mesh(self, s: Snapshot) -> None:
+        now, period = time.monotonic(), MESH_EVERY_S + 0.1 * len(self.server.get_clients())
+        due = now - self._mesh_asked > (period if not self._mesh_pending else 20.0)
+        if self.mesh_wanted and due and s.frame != self._mesh_frame and s.state not in (State.IDLE, State.FAILED):
+            self._mesh_asked, self._mesh_pending, self._mesh_frame = now, True, s.frame
+            self.submit(RequestMesh(self.mesh_voxel_m, TRIANGLE_BUDGET))
+
+    def _tell(self, message: Event | Ack) -> None:
+        if isinstance(message, Ack):
+            self._acknowledged(message)
+            return
+        if isinstance(message, MeshReady):
+            self._mesh_pending = False
+            self.scene.set_mesh(message)
+            if not self._seen_mesh:
+                self._seen_mesh = True
+                for client in self.viewers():
+                    self.scene.show_all(client)
+        elif isinstance(message, Exported):
+            self.jobs.submit(self.deliver, self._askers.pop(message.command_id or -1, None), Path(message.path))
+        elif isinstance(message, Notice):
+            color = {"info": "blue", "warning": "yellow"}.get(message.level, "red")
+            self.toast(message.level.capitalize(), message.text, color)
+        elif isinstance(message, LoopEvent):
+            self.toast("Loop closed", f"Frame {message.frame}: corrected by {message.correction_cm:.1f} cm", "teal")
+        for panel in self.panels:
+            panel.event(message)
+
+    def _acknowledged(self, ack: Ack) -> None:
+        with self._asking:
+            waits = isinstance(ack.command, Export) and not ack.error
+            asker = None if waits else self._askers.pop(ack.command_id, None)
+        if ack.error:
+            self.toast("Not done", ack.error, "red", asker)
+            if isinstance(ack.command, RequestMesh):
+                self._mesh_pending = False
+        for panel in self.panels:
+            panel.ack(ack)
+
+    # ---- browsers ------------------------------------------------------------------------------------------------
+
+    async def _connected(self, client: viser.ClientHandle) -> None:
+        self.post(partial(self.scene.show_all, client, 0.0))
+
+    def _keyframe_clicked(self, client: viser.ClientHandle, index: int) -> None:
+        self.post(partial(self._visit, client, index))
+
+    def _visit(self, client: viser.ClientHandle, index: int) -> None:
+        if self.current is None or index >= len(self.current.keyframes):
+            return
+        keyframe = self.current.keyframes[index]
+        self.scene.visit(client, keyframe)
+        for panel in self.panels:
+            panel.keyframe(keyframe)

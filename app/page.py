@@ -1,0 +1,51 @@
+"""viser's one-file page with our name, style sheet and security headers."""
+
+from __future__ import annotations
+
+import gzip
+from functools import lru_cache
+from pathlib import Path
+
+import viser
+from websockets.datastructures import Headers
+from websockets.http11 import Response
+
+from .theme import STYLE
+
+_ICON = (
+    "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E%3Crect width='32' height='32' "
+    "rx='8' fill='%23ea580c'/%3E%3Cpath d='M6 22c5-14 15-14 20 0M9 12h14' stroke='white' stroke-width='3' fill='none' "
+    "stroke-linecap='round'/%3E%3C/svg%3E"
+)
+# The page may talk only to where it came from: a link with ?websocket=... cannot point it at another server.
+_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob: data:; "
+    "connect-src 'self' ws://{host} wss://{host} blob: data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+
+
+@lru_cache(1)
+def _page() -> tuple[bytes, bytes]:
+    text = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text("utf-8")
+    head = f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style></head>'
+    body = text.replace("<title>Viser</title>", "").replace("</head>", head, 1).encode()
+    return body, gzip.compress(body)
+
+
+def index_page(request: Headers) -> Response:
+    """The answer to a request for the page."""
+    plain, packed = _page()
+    zipped = "gzip" in request.get("Accept-Encoding", "")
+    body = packed if zipped else plain
+    headers = {
+        "Content-Type": "text/html; charset=utf-8",
+        "Content-Length": str(len(body)),
+        "Content-Encoding": "gzip" if zipped else "identity",
+        "Content-Security-Policy": _POLICY.format(host=request.get("Host", "")),
+        "X-Content-Type-Options": "nosniff",
+        "X-Frame-Options": "DENY",
+        "Referrer-Policy": "no-referrer",
+        "Cache-Control": "no-store",
+    }
+    return Response(200, "OK", Headers(headers), body)

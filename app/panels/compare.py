@@ -1,0 +1,73 @@
+"""Two runs side by side: the other one's trajectory and mesh in the scene, both runs' figures in a table."""
+
+from __future__ import annotations
+
+from html import escape
+
+from ecslam.messages import Snapshot
+
+from .. import theme
+from ..hub import Hub
+from ..panel import BasePanel
+from ..runs import Run, load_mesh
+
+_FIGURES = (
+    ("preset", "preset", None),
+    ("ate_rmse_cm", "ATE RMSE, cm", 2),
+    ("ate_max_cm", "ATE max, cm", 2),
+    ("fps_wall", "frames/s, wall", 1),
+    ("fps_engine", "frames/s, engine", 1),
+    ("peak_memory_mb", "peak memory, MB", 0),
+    ("frames", "frames", 0),
+    ("keyframes", "keyframes", 0),
+    ("loop_closures", "loops closed", 0),
+    ("lost_frames", "frames lost", 0),
+    ("depth_l1_cm", "Depth L1, cm", 2),
+    ("accuracy_cm", "Accuracy, cm", 2),
+    ("completion_cm", "Completion, cm", 2),
+    ("completion_ratio", "Completion ratio, %", 1),
+)
+
+
+class Panel(BasePanel):
+    """Comparison with the second run of ``ecslam view RUN1 RUN2``."""
+
+    tab, order = "Run", 20
+
+    @classmethod
+    def applies(cls, hub: Hub) -> bool:
+        return hub.replay is not None and bool(hub.replay.others)
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        assert hub.replay is not None
+        gui, self._run, self._other = hub.server.gui, hub.replay.run, hub.replay.others[0]
+        gui.add_html(figures_table(self._run, self._other))
+        gui.add_html(theme.legend([(self._run.name, theme.ESTIMATE), (self._other.name, theme.OTHER)]))
+        self._shown = (self._run.name, self._other.name) if self._run.name != self._other.name else ("First", "Second")
+        mesh = gui.add_button_group("Mesh of", self._shown)
+        hub.on(mesh, lambda event: self._show_mesh(mesh.value == self._shown[1]))
+
+    def snapshot(self, s: Snapshot) -> None:
+        self.hub.scene.compare(self._other.trajectory[: s.frame + 1, :3, 3])
+
+    def _show_mesh(self, other: bool) -> None:
+        run = self._other if other else self._run
+        path = run.mesh_at(int(run.rows[-1]["frame"]))
+        if path is not None:
+            self.hub.scene.show_mesh(load_mesh(path))
+
+
+def figures_table(a: Run, b: Run) -> str:
+    """The figures that at least one of two runs has, as an HTML table."""
+    rows = "".join(
+        f"<tr><td>{label}</td><td>{_text(a, key, digits)}</td><td>{_text(b, key, digits)}</td></tr>"
+        for key, label, digits in _FIGURES
+        if a.summary.get(key) is not None or b.summary.get(key) is not None
+    )
+    return f'<div class="ec"><table><tr><th></th><th>{escape(a.name)}</th><th>{escape(b.name)}</th></tr>{rows}</table></div>'
+
+
+def _text(run: Run, key: str, digits: int | None) -> str:
+    value = run.summary.get(key)
+    return escape(str(value or "–")) if digits is None or not isinstance(value, (int, float)) else f"{value:.{digits}f}"

@@ -1,0 +1,127 @@
+"""Steering a live run: pause, resume, step, run to, stop, start over, live parameters; hot keys space and n."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ecslam.config import load_preset
+from ecslam.messages import (
+    Command,
+    LoadPreset,
+    Pause,
+    Restart,
+    Resume,
+    RunTo,
+    Snapshot,
+    SpeedLimit,
+    State,
+    Step,
+    Stop,
+    Tune,
+)
+from ecslam.types import InputError
+
+from ..hub import Hub
+from ..panel import BasePanel
+
+SCHEDULES = ("strict", "overlap")
+_VERBS: dict[str, Command] = {"Pause": Pause(), "Resume": Resume(), "Step": Step(), "Stop": Stop()}
+
+
+class Panel(BasePanel):
+    """Run controls for a live engine."""
+
+    tab, order = "Run", 10
+
+    @classmethod
+    def applies(cls, hub: Hub) -> bool:
+        return hub.replay is None
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        gui = hub.server.gui
+        verbs = gui.add_button_group("Run", tuple(_VERBS))
+        hub.commands(verbs, lambda: _VERBS[verbs.value])
+        self._until = gui.add_number("Frame", 1, min=1, max=1_000_000, step=1, hint="Go on until this frame, then pause")
+        hub.commands(gui.add_button("Run to frame", color="gray"), lambda: RunTo(int(self._until.value) - 1))
+        self._limit = gui.add_slider("Speed limit", 0, 60, 1, 0, hint="Frames per second at most; 0 lifts the limit")
+        hub.on(self._limit, lambda event: hub.submit(SpeedLimit(float(self._limit.value)), event.client))
+        self._hot_keys()
+        self._start_over()
+        self._live_parameters()
+
+    def snapshot(self, s: Snapshot) -> None:
+        if int(self._until.max or 0) != s.frames_total:
+            self._until.max = s.frames_total
+            self._until.value = max(1, s.frames_total // 2)
+        if s.preset != self._shown_preset:
+            self._show_preset(s.preset)
+        if self._sequence.value != s.sequence and not self._shown_sequence and s.sequence in self._sequence.options:
+            self._sequence.value = s.sequence
+        self._shown_sequence = s.sequence
+
+    def _hot_keys(self) -> None:
+        gui = self.hub.server.gui
+        toggle = gui.add_command("Pause or resume", hotkey="space", description="Stop after this frame, or go on")
+        step = gui.add_command("Step one frame", hotkey="N", description="Process one frame, then pause")
+
+        @toggle.on_trigger
+        async def _(event: Any) -> None:
+            paused = self.hub.current is not None and self.hub.current.state == State.PAUSED
+            self.hub.submit(Resume() if paused else Pause(), event.client)
+
+        @step.on_trigger
+        async def _(event: Any) -> None:
+            self.hub.submit(Step(), event.client)
+
+    def _start_over(self) -> None:
+        gui, engine = self.hub.server.gui, self.hub.engine
+        current = engine.latest()
+        self._shown_sequence, self._shown_preset = "", ""
+        sequences = engine.sequences or ("synthetic/studio",)
+        presets = engine.presets or ("lite",)
+        with gui.add_folder("Start over"):
+            self._sequence = gui.add_dropdown(
+                "Sequence", sequences, initial_value=_choose(current.sequence if current else "", sequences)
+            )
+            self._preset = gui.add_dropdown(
+                "Preset", presets, initial_value=_choose(current.preset if current else "lite", presets)
+            )
+            self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
+            self._schedule = gui.add_dropdown("Schedule", SCHEDULES, hint="strict: repeatable; overlap: mapping in parallel")
+            self.hub.commands(gui.add_button("Restart", color="orange"), self._restart)
+            self.hub.commands(
+                gui.add_button("Go on with this preset", color="gray", hint="Its tracking and mapping settings from here"),
+                lambda: LoadPreset(self._preset.value),
+            )
+
+    def _restart(self) -> Restart:
+        return Restart(self._sequence.value, self._preset.value, int(self._seed.value), self._schedule.value)
+
+    def _live_parameters(self) -> None:
+        gui = self.hub.server.gui
+        with gui.add_folder("Live parameters", expand_by_default=False):
+            self._iterations = {
+                key: gui.add_slider(label, 1, 60, 1, 10)
+                for key, label in (
+                    ("tracking.iterations", "Tracking iterations"),
+                    ("mapping.iterations", "Mapping iterations"),
+                )
+            }
+        for key, slider in self._iterations.items():
+            self.hub.on(slider, lambda event, key=key: self.hub.submit(Tune(key, int(event.target.value)), event.client))
+
+    def _show_preset(self, name: str) -> None:
+        self._shown_preset = name
+        if name in self._preset.options:
+            self._preset.value = name
+        try:
+            config = load_preset(name)
+        except InputError:
+            return
+        for key, slider in self._iterations.items():
+            slider.value = min(getattr(config, key.split(".")[0]).iterations, int(slider.max))
+
+
+def _choose(wanted: str, options: tuple[str, ...]) -> str:
+    return wanted if wanted in options else options[0]

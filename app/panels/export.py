@@ -1,0 +1,75 @@
+"""Taking away: mesh, trajectory, keyframes, configuration, the whole run, a screenshot, an HTML replay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import viser
+from ecslam.messages import Export
+
+from ..hub import Hub
+from ..panel import BasePanel
+from ..record import html_replay
+
+SCREENSHOT_TIMEOUT_S = 30.0
+
+
+class Panel(BasePanel):
+    """Every file also stays in the run folder; the toast says where."""
+
+    tab, order = "Export", 10
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        gui = hub.server.gui
+        with gui.add_folder("Mesh"):
+            mesh = gui.add_dropdown("Format", ("PLY", "GLB", "OBJ"))
+            voxel = gui.add_slider("Voxel size (cm)", 1.0, 10.0, 0.5, 2.0)
+            hub.commands(
+                gui.add_button("Export mesh", icon=viser.Icon.DOWNLOAD),
+                lambda: Export("mesh", mesh.value.lower(), voxel.value / 100),
+            )
+        with gui.add_folder("Poses"):
+            poses = gui.add_dropdown("Format", ("TUM", "KITTI"))
+            hub.commands(
+                gui.add_button("Export trajectory", icon=viser.Icon.DOWNLOAD), lambda: Export("trajectory", poses.value.lower())
+            )
+            hub.commands(gui.add_button("Export keyframes", icon=viser.Icon.DOWNLOAD, color="gray"), lambda: Export("keyframes"))
+        with gui.add_folder("Everything else"):
+            hub.commands(gui.add_button("Export run as zip", icon=viser.Icon.FILE_ZIP, color="gray"), lambda: Export("run", "zip"))
+            hub.commands(gui.add_button("Export configuration", icon=viser.Icon.SETTINGS, color="gray"), lambda: Export("config"))
+            hub.on(gui.add_button("Save screenshot", icon=viser.Icon.CAMERA, color="gray"), self._later(self._screenshot))
+            hub.on(gui.add_button("Save HTML replay", icon=viser.Icon.MOVIE, color="gray"), self._later(self._replay))
+
+    def _later(self, job: Any) -> Any:
+        """An action that runs ``job(client)`` aside and delivers the file it returns."""
+
+        def run(client: Any) -> None:
+            try:
+                self.hub.deliver(client, job(client))
+            except (OSError, RuntimeError, TimeoutError) as error:
+                self.hub.toast("Not saved", str(error), "red", client)
+
+        return lambda event: self.hub.jobs.submit(run, event.client)
+
+    def _path(self, name: str) -> Path:
+        folder = self.hub.engine.run_folder / "exports"
+        folder.mkdir(parents=True, exist_ok=True)
+        frame = 0 if self.hub.current is None else self.hub.current.frame + 1
+        return folder / name.format(frame=frame)
+
+    def _screenshot(self, client: Any) -> Path:
+        height, width = client.camera.image_height, client.camera.image_width
+        picture = client.get_render(height, width, transport_format="png", timeout=SCREENSHOT_TIMEOUT_S)
+        path = self._path("screenshot_{frame:06d}.png")
+        iio.imwrite(path, picture)
+        return path
+
+    def _replay(self, client: Any) -> Path:
+        if self.hub.current is None:
+            raise RuntimeError("there is nothing to replay before the first frame")
+        path = self._path("replay_{frame:06d}.html")
+        path.write_text(html_replay(self.hub.current, self.hub.scene.mesh, self.hub.history, self.hub.dark), "utf-8")
+        return path

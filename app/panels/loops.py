@@ -1,0 +1,95 @@
+"""The loop-closure inspector: a timeline of the error with a marker per event; choosing one flies there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from ecslam.messages import LoopEvent, PauseOnLoop, Snapshot
+
+from .. import theme
+from ..history import discrepancy
+from ..hub import Hub
+from ..panel import BasePanel
+from .plots import Chart
+
+NONE = "None"
+
+
+class Panel(BasePanel):
+    """Timeline, choice of an event, its figures."""
+
+    tab, order = "Loops", 10
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        gui = hub.server.gui
+        self._events: tuple[LoopEvent, ...] = ()
+        self._chart = Chart(hub, "Rotation error (°)", markers=True)
+        self._choice = gui.add_dropdown("Loop event", (NONE,), initial_value=NONE)
+        hub.on(self._choice, lambda event: self._inspect(event.client))
+        steps = gui.add_button_group("Go to", ("Previous event", "Next event"))
+        hub.on(steps, lambda event: self._move(-1 if steps.value.startswith("Prev") else 1, event.client))
+        self._html = gui.add_html(_intro())
+        gui.add_html(
+            theme.legend([("links", theme.LOOP), ("before", theme.BEFORE), ("after", theme.ESTIMATE), ("window", theme.WINDOW)])
+        )
+        if hub.replay is None:
+            pause = gui.add_checkbox("Pause on loop closure", False)
+            hub.on(pause, lambda event: hub.submit(PauseOnLoop(bool(pause.value)), event.client))
+
+    def snapshot(self, s: Snapshot) -> None:
+        if len(s.loops) != len(self._events):
+            self._events = s.loops
+            self._choice.options = (NONE, *(_name(e) for e in s.loops))
+        title, frames, values = discrepancy(s)
+        marks = np.full(len(frames), np.nan)
+        for event in s.loops:
+            at = int(np.argmin(np.abs(frames - event.frame)))
+            marks[at] = np.nan_to_num(values[at])
+        self._chart.show([title, "loop closed"], (frames, values, marks))
+
+    def _move(self, step: int, client: Any) -> None:
+        if self._events:
+            options = list(self._choice.options)
+            at = options.index(self._choice.value) + step
+            self._choice.value = options[(at - 1) % (len(options) - 1) + 1]
+            self._inspect(client)
+
+    def _inspect(self, client: Any) -> None:
+        event = next((e for e in self._events if _name(e) == self._choice.value), None)
+        s = self.hub.current
+        self.hub.scene.inspect(event, self.hub.history.window_at(event.frame) if event else ())
+        self._html.content = _intro() if event is None else _figures(event)
+        if s is None:
+            return
+        self.hub.scene.update(s)
+        if event is not None and event.frame < len(s.trajectory) and client is not None:
+            path = np.concatenate([s.trajectory[: event.frame + 1, :3, 3], event.trajectory_before])
+            self.hub.scene.show_box(client, path.min(0), path.max(0))
+
+
+def _name(event: LoopEvent) -> str:
+    return f"Frame {event.frame + 1}: {event.correction_cm:.1f} cm"
+
+
+def _intro() -> str:
+    return (
+        '<div class="ec dim">When old keyframes come back into the window, the joint optimisation closes the loop. '
+        "Choose an event to see the links and the path before and after.</div>"
+    )
+
+
+def _figures(e: LoopEvent) -> str:
+    rows = [
+        ("Weighted loss", theme.number(e.loss_before, 3), theme.number(e.loss_after, 3)),
+        ("Position error, cm", theme.number(e.error_before_cm), theme.number(e.error_after_cm)),
+        ("Rotation error, °", theme.number(e.rotation_error_before_deg), theme.number(e.rotation_error_after_deg)),
+    ]
+    body = "".join(f"<tr><td>{name}</td><td>{before}</td><td><b>{after}</b></td></tr>" for name, before, after in rows)
+    old = ", ".join(str(k + 1) for k in e.keyframes)
+    return (
+        f'<div class="ec"><b>Frame {e.frame + 1} met keyframes {old}</b><br>The pose moved by '
+        f"<b>{e.correction_cm:.2f} cm</b> and <b>{e.correction_deg:.2f}°</b>."
+        f"<table><tr><th></th><th>before</th><th>after</th></tr>{body}</table></div>"
+    )

@@ -1,0 +1,75 @@
+"""Six pictures of the current frame or of a chosen keyframe: colour and depth as input, rendered, and their difference."""
+
+from __future__ import annotations
+
+import base64
+import time
+
+import cv2
+import numpy as np
+from ecslam.messages import Event, FramePictures, KeyframeView, RequestPictures, Snapshot, State
+from numpy.typing import NDArray
+
+from ..hub import Hub
+from ..panel import BasePanel
+
+EVERY_S = 1.0
+_ORDER = (
+    ("color", "colour"),
+    ("depth", "depth"),
+    ("color_rendered", "colour, rendered"),
+    ("depth_rendered", "depth, rendered"),
+    ("color_difference", "colour, difference"),
+    ("depth_difference", "depth, difference"),
+)
+
+
+class Panel(BasePanel):
+    """The pictures; rendered by the engine about once a second while somebody looks."""
+
+    tab, order = "Pictures", 10
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        gui = hub.server.gui
+        self._html = gui.add_html(_message("No pictures yet."))
+        self._asked, self._asked_frame, self._keyframe = 0.0, -1, False
+        if hub.replay is None:
+            self._live = gui.add_checkbox("Refresh while running", True)
+            hub.on(gui.add_button("Show current frame", color="gray"), self._show_current)
+
+    def snapshot(self, s: Snapshot) -> None:
+        if self.hub.replay is not None:
+            return
+        due = time.monotonic() - self._asked > EVERY_S or s.state in (State.PAUSED, State.FINISHED)
+        looked_at = self._live.value and not self._keyframe and bool(self.hub.server.get_clients())
+        if looked_at and due and s.frame != self._asked_frame:
+            self._asked, self._asked_frame = time.monotonic(), s.frame
+            self.hub.submit(RequestPictures())
+
+    def event(self, event: Event) -> None:
+        if isinstance(event, FramePictures):
+            figures = "".join(_figure(getattr(event, field), name) for field, name in _ORDER)
+            title = f"Keyframe {event.frame + 1}" if self._keyframe else f"Frame {event.frame + 1}"
+            self._html.content = f'<div class="ec"><b>{title}</b><div class="ec-six">{figures}</div></div>'
+
+    def keyframe(self, keyframe: KeyframeView) -> None:
+        self._keyframe = True
+        figure = _figure(keyframe.thumbnail, "colour")
+        self._html.content = f'<div class="ec"><b>Keyframe {keyframe.frame + 1}</b><div class="ec-six">{figure}</div></div>'
+        if self.hub.replay is None:
+            self.hub.submit(RequestPictures(keyframe.frame))
+
+    def _show_current(self, event: object) -> None:
+        self._keyframe = False
+        self.hub.submit(RequestPictures())
+
+
+def _figure(picture: NDArray[np.uint8], name: str) -> str:
+    ok, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
+    text = base64.b64encode(data.tobytes()).decode() if ok else ""
+    return f'<figure><img src="data:image/jpeg;base64,{text}" alt="{name}"><figcaption>{name}</figcaption></figure>'
+
+
+def _message(text: str) -> str:
+    return f'<div class="ec dim">{text}</div>'

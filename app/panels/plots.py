@@ -1,0 +1,97 @@
+"""Error, losses and times over the frames."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from ecslam.messages import Snapshot, State
+from numpy.typing import NDArray
+from viser import uplot
+
+from .. import theme
+from ..hub import Hub
+from ..panel import BasePanel
+
+EVERY_S = 0.5
+_ERROR = "Error so far (ATE, cm)"
+_PALETTE = (theme.ESTIMATE, theme.TRUTH, theme.WINDOW, theme.LOOP, (234, 179, 8), theme.BEFORE, theme.KEYFRAME)
+
+
+class Chart:
+    """One uPlot chart whose series can grow in number."""
+
+    def __init__(self, hub: Hub, title: str, height: int = 170, legend: bool = True, markers: bool = False) -> None:
+        """``markers`` draws the last series as points only."""
+        self._gui, self._names, self._markers = hub.server.gui, [""], markers
+        self._plot = self._gui.add_uplot(
+            (np.array([0.0, 1.0]), np.array([np.nan, np.nan])),
+            (uplot.Series(label="frame"), uplot.Series(label=title)),
+            title=title,
+            height=height,
+            axes=_axes(),
+            legend=uplot.Legend(show=legend),
+            cursor=uplot.Cursor(drag=uplot.Cursor_Drag(x=False, y=False)),
+            padding=(6, 14, 0, 0),
+        )
+
+    def show(self, names: list[str], columns: tuple[NDArray[np.float64], ...]) -> None:
+        """Draw columns (frame numbers first) under ``names``, with an explicit range."""
+        names = [n for n, column in zip(names, columns[1:], strict=True) if np.isfinite(column).any()]
+        columns = (columns[0], *(c for c in columns[1:] if np.isfinite(c).any()))
+        if not names or len(columns[0]) < 2:
+            return
+        if names != self._names:
+            self._names = names
+            lines = [_line(name, k) for k, name in enumerate(names)]
+            if self._markers and len(names) > 1:
+                lines[-1] = _dots(names[-1])
+            self._plot.series = (uplot.Series(label="frame"), *lines)
+        high = max(float(np.nanmax(c)) for c in columns[1:])
+        self._plot.scales = {
+            "x": uplot.Scale(time=False, range=(float(columns[0][0]), float(columns[0][-1]))),
+            "y": uplot.Scale(range=(0.0, high * 1.08 + 1e-6)),
+        }
+        self._plot.data = columns
+
+
+class Panel(BasePanel):
+    """Three charts, refreshed twice a second at most."""
+
+    tab, order = "Plots", 10
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        self._error, self._losses, self._times = (
+            Chart(hub, title, legend=title != _ERROR) for title in (_ERROR, "Weighted losses", "Time per frame (ms)")
+        )
+        self._shown = 0.0
+
+    def snapshot(self, s: Snapshot) -> None:
+        now = time.monotonic()
+        moving = s.state in (State.TRACKING, State.MAPPING, State.INITIALISING)
+        if moving and now - self._shown < EVERY_S:
+            return
+        self._shown = now
+        history, losses = self.hub.history, self.hub.history.names()
+        with self.hub.server.atomic():
+            self._error.show(["ATE"], history.series(["ate_cm"]))
+            self._losses.show([n.removeprefix("loss ").replace("_", " ") for n in losses], history.series(losses))
+            self._times.show(["tracking", "mapping"], history.series(["track_ms", "map_ms"]))
+
+
+def _line(name: str, index: int) -> uplot.Series:
+    return uplot.Series(label=name, stroke=theme.css(_PALETTE[index % len(_PALETTE)]), width=1.6, spanGaps=True)
+
+
+def _dots(name: str) -> uplot.Series:
+    color = theme.css(theme.LOOP)
+    points = uplot.Series_Points(show=True, size=11, fill=color, stroke="white", width=2)
+    return uplot.Series(label=name, stroke=color, width=0, points=points)
+
+
+def _axes() -> tuple[uplot.Axis, ...]:
+    grid = uplot.Axis_Grid(stroke="rgba(128,128,128,0.18)", width=1)
+    ticks = uplot.Axis_Ticks(stroke="rgba(128,128,128,0.3)", width=1)
+    style = {"stroke": "rgb(128,134,146)", "grid": grid, "ticks": ticks, "font": "11px system-ui"}
+    return uplot.Axis(size=28, **style), uplot.Axis(size=46, **style)  # type: ignore[typeddict-item]

@@ -1,0 +1,34 @@
+"""Moving through a finished run: play, pause, step, and a slider over its frames."""
+
+from __future__ import annotations
+
+from ecslam.messages import Command, Pause, Resume, RunTo, Snapshot, SpeedLimit, Step
+
+from ..hub import Hub
+from ..panel import BasePanel
+
+_VERBS: dict[str, Command] = {"Play": Resume(), "Pause": Pause(), "Step": Step()}
+
+
+class Panel(BasePanel):
+    """The time line of a replay."""
+
+    tab, order = "Run", 10
+
+    @classmethod
+    def applies(cls, hub: Hub) -> bool:
+        return hub.replay is not None
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        gui, last = hub.server.gui, len(hub.replay.run.rows) if hub.replay else 1
+        self._slider = gui.add_slider("Frame", 1, max(last, 2), 1, last)
+        hub.on(self._slider, lambda event: hub.submit(RunTo(int(self._slider.value) - 1)))
+        verbs = gui.add_button_group("Replay", tuple(_VERBS))
+        hub.commands(verbs, lambda: _VERBS[verbs.value])
+        speed = gui.add_slider("Frames per second", 1, 60, 1, 20)
+        hub.on(speed, lambda event: hub.submit(SpeedLimit(float(speed.value)), event.client))
+
+    def snapshot(self, s: Snapshot) -> None:
+        if s.state.value == "tracking":
+            self._slider.value = s.frame + 1

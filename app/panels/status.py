@@ -1,0 +1,74 @@
+"""What is going on, in plain words and figures; always in sight above the tabs."""
+
+from __future__ import annotations
+
+from html import escape
+
+from ecslam.messages import Ack, Pause, Resume, Snapshot, State, Step, Stop
+
+from .. import theme
+from ..hub import Hub
+from ..panel import BasePanel
+
+WORDS = {
+    State.IDLE: "Ready to start",
+    State.INITIALISING: "Initialising the map",
+    State.TRACKING: "Tracking",
+    State.MAPPING: "Mapping",
+    State.LOST: "Lost",
+    State.RELOCALISING: "Relocalising",
+    State.PAUSED: "Paused",
+    State.FINISHED: "Finished",
+    State.FAILED: "Failed",
+}
+_COMING = {Pause: "Pausing …", Stop: "Stopping …", Step: "One step …", Resume: "Resuming …"}
+
+
+class Panel(BasePanel):
+    """State, progress, rates, times, error, memory, keyframes, window, loops."""
+
+    tab, order = "", 0
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        self._coming = ""
+        self._html = hub.server.gui.add_html(render(None, ""))
+
+    def snapshot(self, s: Snapshot) -> None:
+        self._coming = ""
+        self._html.content = render(s, "")
+
+    def ack(self, ack: Ack) -> None:
+        self._coming = _COMING.get(type(ack.command), "")
+        settled = self.hub.current is not None and self.hub.current.state in (State.PAUSED, State.FINISHED, State.FAILED)
+        if self._coming and not ack.error and not (settled and isinstance(ack.command, (Pause, Stop))):
+            self._html.content = render(self.hub.current, self._coming)
+
+
+def render(s: Snapshot | None, coming: str) -> str:
+    """The status card as HTML; ``coming`` replaces the state while a command is being carried out."""
+    if s is None:
+        return f'<div class="ec"><div class="ec-head">{theme.chip("Waiting for the first frame", theme.KEYFRAME)}</div></div>'
+    color = theme.STATE_COLORS[s.state.value]
+    done = 100 * (s.frame + 1) / max(s.frames_total, 1)
+    cells = [
+        theme.cell(theme.number(s.fps_wall, 1), "/s", "frames, wall clock"),
+        theme.cell(theme.number(s.fps_engine, 1), "/s", "frames, engine"),
+        theme.cell(theme.number(s.ate_cm), "cm" if s.ate_cm is not None else "", "ATE so far"),
+        theme.cell(theme.number(s.track_ms, 0), "ms", "tracking"),
+        theme.cell(theme.number(s.map_ms, 0), "ms", "mapping"),
+        theme.cell(theme.number(s.memory_mb, 0), "MB", "memory"),
+        theme.cell(str(len(s.keyframes)), "", "keyframes"),
+        theme.cell(str(len(s.window)), "", "in BA window"),
+        theme.cell(str(len(s.loops)), "", "loops closed"),
+    ]
+    notes = [theme.note(s.reason, color)] if s.reason else []
+    if s.skipped or s.lost_frames:
+        notes.append(theme.note(f"{s.skipped} frames skipped, {s.lost_frames} frames lost", theme.ESTIMATE))
+    return (
+        f'<div class="ec"><div class="ec-head">{theme.chip(coming or WORDS[s.state], color)}'
+        f'<span class="ec-name dim">{escape(s.sequence)} · {escape(s.preset)}</span></div>'
+        f'<div class="ec-row"><span>Frame <b>{s.frame + 1}</b> of {s.frames_total}</span>'
+        f'<span class="dim">{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
+        f'<div class="ec-grid">{"".join(cells)}</div>{"".join(notes)}</div>'
+    )

@@ -1,0 +1,62 @@
+"""How the scene is shown: mesh mode and detail, layers, follow, reset, light or dark."""
+
+from __future__ import annotations
+
+import viser
+
+from .. import theme
+from ..hub import Hub
+from ..panel import BasePanel
+from ..scene import MESH_MODES
+
+
+class Panel(BasePanel):
+    """View options; shared by all viewers except Reset view."""
+
+    tab, order = "View", 10
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        gui = hub.server.gui
+        mode = gui.add_button_group("Mesh", MESH_MODES)
+        hub.on(mode, lambda event: self._set_mode(mode.value))
+        if hub.replay is None:
+            detail = gui.add_slider("Mesh detail (cm)", 2.0, 12.0, 0.5, 100 * hub.mesh_voxel_m)
+            hub.on(detail, lambda event: self._set_detail(detail.value))
+        for label, group in (("Ground truth", "trajectory/ground truth"), ("Keyframes", "keyframes")):
+            layer = gui.add_checkbox(label, True)
+            hub.on(layer, lambda event, group=group: hub.scene.set_visible(group, bool(event.target.value)))
+        follow = gui.add_checkbox("Follow camera", False)
+        hub.on(follow, lambda event: self._set_follow(bool(follow.value)))
+        hub.on(gui.add_button("Reset view", icon=viser.Icon.FOCUS_CENTERED, color="gray"), lambda event: hub.scene.show_all(event.client))
+        dark = gui.add_checkbox("Dark", hub.dark)
+        hub.on(dark, lambda event: self._set_dark(bool(dark.value)))
+        gui.add_html(
+            theme.legend(
+                [
+                    ("estimate", theme.ESTIMATE),
+                    ("ground truth", theme.TRUTH),
+                    ("keyframes", theme.KEYFRAME),
+                    ("BA window", theme.WINDOW),
+                    ("loop closure", theme.LOOP),
+                ]
+            )
+        )
+
+    def _set_mode(self, mode: str) -> None:
+        self.hub.mesh_wanted = mode != "Off"
+        self.hub.scene.set_mode(mode)
+
+    def _set_detail(self, centimetres: float) -> None:
+        self.hub.mesh_voxel_m = centimetres / 100
+        self.hub.remesh()
+
+    def _set_follow(self, on: bool) -> None:
+        self.hub.follow = on
+        if on and self.hub.current is not None and len(self.hub.current.trajectory):
+            for client in self.hub.viewers():
+                self.hub.scene.follow(client, self.hub.current.trajectory[-1])
+
+    def _set_dark(self, on: bool) -> None:
+        self.hub.dark = on
+        self.hub.theme()

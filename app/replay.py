@@ -1,0 +1,200 @@
+"""A finished run behind the same door as a live engine: play, pause, step, scrub, export; no field, no torch."""
+
+from __future__ import annotations
+
+import queue
+import shutil
+import threading
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from ecslam.messages import (
+    Ack,
+    Command,
+    Export,
+    Exported,
+    MeshReady,
+    Pause,
+    Quit,
+    RequestMesh,
+    RequestPictures,
+    Resume,
+    RunTo,
+    Snapshot,
+    SpeedLimit,
+    State,
+    Step,
+)
+from ecslam.runtime.feed import Feed, FeedSubscription
+from ecslam.types import InputError
+
+from .history import FIGURES, History
+from .runs import Run, kitti_lines, load_mesh, tum_lines
+
+FRAMES_PER_S = 20.0
+
+
+class ReplayEngine:
+    """Replays ``run``; ``others`` are shown beside it for comparison."""
+
+    presets: tuple[str, ...] = ()
+
+    def __init__(self, run: Run, others: tuple[Run, ...] = ()) -> None:
+        self.run, self.others = run, others
+        self.run_folder = run.folder
+        self.sequences = (str(run.summary.get("sequence", run.name)),)
+        self.history = run_history(run)
+        self._frame, self._playing, self._period = len(run.rows) - 1, False, 1 / FRAMES_PER_S
+        self._inbox: queue.SimpleQueue[tuple[int, Command] | None] = queue.SimpleQueue()
+        self._ids, self._lock = 0, threading.Lock()
+        self._feed = Feed()
+        self._feed.publish(self._snapshot())
+        self._thread = threading.Thread(target=self._work, name="replay", daemon=True)
+        self._thread.start()
+
+    def submit(self, command: Command) -> int:
+        """Queue a command."""
+        with self._lock:
+            self._ids += 1
+            self._inbox.put((self._ids, command))
+            return self._ids
+
+    def latest(self) -> Snapshot | None:
+        """The state at the frame on show."""
+        return self._feed.latest()
+
+    def subscribe(self) -> FeedSubscription:
+        """Start reading the feed."""
+        return self._feed.subscribe()
+
+    def close(self) -> None:
+        """End the replay's thread."""
+        self._inbox.put(None)
+        self._thread.join(5)
+
+    # ---- the thread ----------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        due = 0.0
+        while True:
+            try:
+                wait = max(0.0, due - time.monotonic()) if self._playing else None
+                item = self._inbox.get(timeout=wait)
+            except queue.Empty:
+                due = time.monotonic() + self._period
+                self._go_to(self._frame + 1)
+                continue
+            if item is None:
+                return
+            error = ""
+            try:
+                self._obey(*item)
+            except (InputError, OSError) as problem:
+                error = str(problem)
+            self._feed.publish(Ack(*item, error))
+
+    def _obey(self, number: int, command: Command) -> None:
+        last = len(self.run.rows) - 1
+        if isinstance(command, (Pause, Quit)):
+            self._playing = False
+            self._go_to(self._frame)
+        elif isinstance(command, Resume):
+            self._playing = True
+            self._go_to(0 if self._frame >= last else self._frame)
+        elif isinstance(command, Step):
+            self._playing = False
+            self._go_to(self._frame + 1)
+        elif isinstance(command, RunTo):
+            self._playing = False
+            self._go_to(command.frame)
+        elif isinstance(command, SpeedLimit):
+            self._period = 1 / (command.frames_per_s or FRAMES_PER_S)
+        elif isinstance(command, RequestMesh):
+            path = self.run.mesh_at(self._row_frame())
+            if path is not None:
+                self._feed.publish(MeshReady(self._row_frame(), command.voxel_m, load_mesh(path)))
+        elif isinstance(command, Export):
+            self._feed.publish(Exported(command.kind, str(export(self.run, command)), number))
+        elif not isinstance(command, RequestPictures):
+            raise InputError(f"{type(command).__name__}: a finished run cannot do that; start one with `ecslam run`")
+
+    def _row_frame(self) -> int:
+        return int(self.run.rows[self._frame]["frame"])
+
+    def _go_to(self, frame: int) -> None:
+        last = len(self.run.rows) - 1
+        self._frame = min(max(frame, 0), last)
+        self._playing = self._playing and self._frame < last
+        self._feed.publish(self._snapshot())
+
+    def _snapshot(self) -> Snapshot:
+        run, i = self.run, self._frame
+        row, frame = run.rows[i], int(run.rows[i]["frame"])
+        state = State.TRACKING if self._playing else State.FINISHED if i == len(run.rows) - 1 else State.PAUSED
+        keyframes = tuple(k for k in run.keyframes if k.frame <= frame)
+        thumbnail = keyframes[-1].thumbnail if keyframes and keyframes[-1].thumbnail.any() else None
+        return Snapshot(
+            state=state,
+            sequence=self.sequences[0],
+            preset=str(run.summary.get("preset", "")),
+            frame=i,
+            frames_total=len(run.rows),
+            trajectory=run.trajectory[: i + 1],
+            trajectory_gt=run.trajectory_gt,
+            keyframes=keyframes,
+            window=tuple(row.get("window") or self.history.window_at(frame)),
+            color=thumbnail,
+            fov_y_rad=run.fov_y_rad,
+            aspect=run.aspect,
+            losses=dict(row.get("losses") or {}),
+            track_ms=float(row.get("track_ms") or 0),
+            map_ms=float(row.get("map_ms") or 0),
+            fps_wall=float(run.summary.get("fps_wall") or 0),
+            fps_engine=float(run.summary.get("fps_engine") or 0),
+            ate_cm=row.get("ate_cm"),
+            memory_mb=float(run.summary.get("peak_memory_mb") or 0),
+            loops=tuple(e for e in run.loops if e.frame <= frame),
+            skipped=int(run.summary.get("skipped_frames") or 0),
+            lost_frames=int(run.summary.get("lost_frames") or 0),
+        )
+
+
+def run_history(run: Run) -> History:
+    """The figures of all frames of a run."""
+    history = History()
+    for row in run.rows:
+        figures = {name: float(row[name]) for name in FIGURES if row.get(name) is not None}
+        history.add(int(row["frame"]), figures, row.get("losses") or {}, tuple(row.get("window") or ()))
+    return history
+
+
+def export(run: Run, command: Export) -> Path:
+    """Write what an ``Export`` asks for into the run's ``exports`` folder. Raises InputError for what there is not."""
+    folder = run.folder / "exports"
+    folder.mkdir(parents=True, exist_ok=True)
+    if command.kind == "mesh" and command.format in ("ply", "glb", "obj") and run.meshes:
+        mesh, path = load_mesh(run.meshes[max(run.meshes)]), folder / f"mesh.{command.format}"
+        trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False).export(path)
+        return path
+    if command.kind == "trajectory":
+        path = folder / f"trajectory_{command.format or 'tum'}.txt"
+        path.write_text(kitti_lines(run.trajectory) if command.format == "kitti" else tum_lines(run.timestamps, run.trajectory))
+        return path
+    if command.kind == "keyframes":
+        path = folder / "keyframes.txt"
+        times = np.interp([k.frame for k in run.keyframes], [r["frame"] for r in run.rows], run.timestamps)
+        path.write_text(tum_lines(times, np.array([k.c2w for k in run.keyframes]).reshape(-1, 4, 4)))
+        return path
+    if command.kind == "config" and (run.folder / "config.yaml").is_file():
+        return Path(shutil.copyfile(run.folder / "config.yaml", folder / "config.yaml"))
+    if command.kind == "run":
+        path = folder / f"{run.name}.zip"
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in sorted(run.folder.rglob("*")):
+                if file.is_file() and folder not in file.parents:
+                    archive.write(file, file.relative_to(run.folder))
+        return path
+    raise InputError(f"{run.folder}: this run holds no {command.kind} to export")

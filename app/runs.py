@@ -1,0 +1,179 @@
+"""Reading a finished run's folder, and the two text formats for trajectories."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+import viser.transforms as vt
+from ecslam.messages import KeyframeView, LoopEvent
+from ecslam.types import InputError, Mesh
+from numpy.typing import NDArray
+
+from .geometry import wxyz
+
+Array = NDArray[np.float64]
+_NO_PICTURE = np.zeros((3, 4, 3), np.uint8)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run. rows: one dictionary a frame, as in ``metrics.jsonl``. meshes: path by the frame it was made at."""
+
+    folder: Path
+    summary: dict[str, Any]
+    rows: tuple[dict[str, Any], ...]
+    timestamps: Array
+    trajectory: Array
+    trajectory_gt: Array | None
+    keyframes: tuple[KeyframeView, ...]
+    loops: tuple[LoopEvent, ...]
+    meshes: dict[int, Path]
+    fov_y_rad: float
+    aspect: float
+
+    @property
+    def name(self) -> str:
+        """How the run is called on the page."""
+        return self.folder.resolve().name
+
+    def mesh_at(self, frame: int) -> Path | None:
+        """The newest mesh made at or before ``frame``, else the oldest there is."""
+        past = [f for f in self.meshes if f <= frame]
+        return self.meshes[max(past)] if past else self.meshes[min(self.meshes)] if self.meshes else None
+
+
+def load_run(folder: Path) -> Run:
+    """Read a run folder. Raises InputError when it is not one."""
+    if not (folder / "metrics.jsonl").is_file():
+        raise InputError(f"{folder}: not a run folder (no metrics.jsonl); give the --out folder of `ecslam run`")
+    rows = tuple(row for row in _json_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
+    if not rows:
+        raise InputError(f"{folder / 'metrics.jsonl'}: holds no frame; the run ended before its first one")
+    summary = _json(folder / "summary.json")
+    camera = {"width": 640, "height": 480, "fy": 500.0, **_json(folder / "run.json")}
+    timestamps = np.array([float(row.get("timestamp", row["frame"])) for row in rows])
+    tracked = np.tile(np.eye(4), (len(rows), 1, 1))
+    tracked[:, :3] = np.array([row["c2w"][:12] for row in rows], float).reshape(-1, 3, 4)
+    trajectory = _poses_at(folder / "trajectory.txt", timestamps)
+    if trajectory is None or np.isnan(trajectory).any():
+        trajectory = tracked
+    events = [e for e in _json_lines(folder / "events.jsonl") if e.get("type") == "loop"]
+    return Run(
+        folder=folder,
+        summary=summary,
+        rows=rows,
+        timestamps=timestamps,
+        trajectory=trajectory,
+        trajectory_gt=_poses_at(folder / "groundtruth.txt", timestamps),
+        keyframes=_keyframes(folder, rows, trajectory),
+        loops=tuple(_loop_event(e) for e in events),
+        meshes=_meshes(folder, int(rows[-1]["frame"])),
+        fov_y_rad=float(2 * np.arctan(camera["height"] / 2 / camera["fy"])),
+        aspect=float(camera["width"] / camera["height"]),
+    )
+
+
+def load_mesh(path: Path) -> Mesh:
+    """A mesh file as our type. Raises InputError when it cannot be read."""
+    try:
+        loaded = trimesh.load_mesh(path, process=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a readable mesh ({error}); make it again with `ecslam mesh`") from None
+    colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(np.uint8) if loaded.visual.kind == "vertex" else None
+    return Mesh(np.asarray(loaded.vertices, np.float32), np.asarray(loaded.faces, np.int32), colors)
+
+
+def tum_lines(timestamps: Array, c2w: Array) -> str:
+    """``timestamp tx ty tz qx qy qz qw`` a line; frames without a pose are left out."""
+    out = []
+    for t, pose in zip(timestamps, c2w, strict=True):
+        if np.isfinite(pose).all():
+            w, x, y, z = wxyz(pose)
+            out.append(f"{t:.6f} " + " ".join(f"{v:.7f}" for v in (*pose[:3, 3], x, y, z, w)))
+    return "\n".join(out) + "\n"
+
+
+def kitti_lines(c2w: Array) -> str:
+    """The upper three rows of every pose, row by row, twelve numbers a line."""
+    return "".join(" ".join(f"{v:.9g}" for v in pose[:3].ravel()) + "\n" for pose in c2w)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _json_lines(path: Path) -> Iterable[dict[str, Any]]:
+    """The lines that can be read; the last one of a killed run may be cut short."""
+    if not path.is_file():
+        return
+    for line in path.read_text("utf-8", "replace").splitlines():
+        try:
+            value = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(value, dict):
+            yield value
+
+
+def _poses_at(path: Path, timestamps: Array) -> Array | None:
+    """Poses [n, 4, 4] of a TUM file at the given times; NaN where it has none within a millisecond."""
+    if not path.is_file():
+        return None
+    numbers = [line.split() for line in path.read_text("utf-8", "replace").splitlines() if line.strip()]
+    numbers = [words for words in numbers if len(words) == 8 and not words[0].startswith("#")]
+    if not numbers:
+        return None
+    table = np.array(numbers, float)
+    out = np.full((len(timestamps), 4, 4), np.nan)
+    order = np.argsort(table[:, 0])
+    table = table[order]
+    at = np.clip(np.searchsorted(table[:, 0], timestamps - 1e-3), 0, len(table) - 1)
+    found = np.abs(table[at, 0] - timestamps) < 1e-3
+    out[found] = np.eye(4)
+    out[found, :3, :3] = vt.SO3(table[at[found]][:, [7, 4, 5, 6]]).as_matrix()
+    out[found, :3, 3] = table[at[found], 1:4]
+    return out
+
+
+def _keyframes(folder: Path, rows: tuple[dict[str, Any], ...], trajectory: Array) -> tuple[KeyframeView, ...]:
+    pictures = {int(k["frame"]): k for k in _json_lines(folder / "keyframes.jsonl") if "frame" in k}
+    out = []
+    for row, c2w in zip(rows, trajectory, strict=True):
+        if row.get("keyframe"):
+            frame = int(row["frame"])
+            out.append(KeyframeView(frame, c2w, _picture(folder, pictures.get(frame, {}).get("thumbnail"))))
+    return tuple(out)
+
+
+def _picture(folder: Path, name: Any) -> NDArray[np.uint8]:
+    path = folder / str(name or "")
+    if not name or not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
+        return _NO_PICTURE
+    picture = cv2.imread(str(path))
+    return _NO_PICTURE if picture is None else np.ascontiguousarray(picture[:, :, ::-1], np.uint8)
+
+
+def _loop_event(row: dict[str, Any]) -> LoopEvent:
+    values = {f.name: row.get(f.name) for f in fields(LoopEvent)}
+    values["keyframes"] = tuple(int(k) for k in values["keyframes"] or ())
+    before = np.asarray(values["trajectory_before"] or np.zeros((0, 3)), np.float32).reshape(-1, 3)
+    return LoopEvent(**{**values, "trajectory_before": before})
+
+
+def _meshes(folder: Path, last: int) -> dict[int, Path]:
+    found = {int(p.stem): p for p in (folder / "meshes").glob("*.ply") if re.fullmatch(r"\d+", p.stem)}
+    if (folder / "mesh.ply").is_file():
+        found[last] = folder / "mesh.ply"
+    return found

@@ -1,0 +1,80 @@
+"""The dashboard as one call: ``start`` puts an engine (live or a replay) on a web page, ``view`` opens finished runs."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+
+from ecslam.runtime.protocol import EngineHandle
+from ecslam.types import InputError
+
+from .front import bind, is_loopback, open_viser
+from .hub import Hub
+from .replay import ReplayEngine
+from .runs import load_run
+
+DEFAULT_PORT = 8080
+SHORTEST_TOKEN = 16
+
+
+@dataclass(frozen=True)
+class Dashboard:
+    """A running dashboard. url: the address to open, token included. port: where it listens."""
+
+    url: str
+    host: str
+    port: int
+    hub: Hub
+    engine: EngineHandle
+
+    @property
+    def ssh_hint(self) -> str:
+        """The command that brings the page to another machine."""
+        return f"ssh -L {self.port}:127.0.0.1:{self.port} <this machine>"
+
+    def close(self) -> None:
+        """Close the page; a live engine goes on, a replay ends."""
+        self.hub.close()
+        self.hub.server.stop()
+        if isinstance(self.engine, ReplayEngine):
+            self.engine.close()
+
+
+def start(
+    engine: EngineHandle,
+    host: str = "127.0.0.1",
+    port: int = DEFAULT_PORT,
+    token: str | None = None,
+    dark: bool = False,
+) -> Dashboard:
+    """Serve the dashboard of ``engine``. Raises InputError for a busy port, an unknown host or a short token.
+
+    port 0 takes any free port. A host that other machines can reach always needs a token: without one given a fresh
+    one is made. The token is part of ``Dashboard.url``; the page then keeps it in a cookie.
+    """
+    if token is not None and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.replace("-", "_").isidentifier()):
+        raise InputError(f"--token: use at least {SHORTEST_TOKEN} letters, digits, '-' or '_', beginning with a letter")
+    if token is None and not is_loopback(host):
+        token = f"t{secrets.token_urlsafe(24)}"
+    listener = bind(host, port)
+    server = open_viser(listener, host, token, "EC-SLAM")
+    hub = Hub(engine, server, dark)
+    hub.start()
+    bound = listener.getsockname()[1]
+    shown = "localhost" if host in ("0.0.0.0", "::", "127.0.0.1") else f"[{host}]" if ":" in host else host
+    url = f"http://{shown}:{bound}/" + (f"?token={token}" if token else "")
+    return Dashboard(url, host, bound, hub, engine)
+
+
+def view(
+    runs: list[Path], host: str = "127.0.0.1", port: int = DEFAULT_PORT, token: str | None = None, dark: bool = False
+) -> Dashboard:
+    """Open one finished run, or compare two on the same sequence. Raises InputError."""
+    if not 1 <= len(runs) <= 2:
+        raise InputError("view takes one run folder, or two to compare")
+    loaded = [load_run(folder) for folder in runs]
+    names = {str(run.summary.get("sequence", "")) for run in loaded}
+    if len(names) > 1:
+        raise InputError(f"{runs[0]} and {runs[1]}: runs on different sequences ({', '.join(sorted(names))}) cannot be compared")
+    return start(ReplayEngine(loaded[0], tuple(loaded[1:])), host, port, token, dark)

@@ -1,0 +1,99 @@
+"""Colours, style sheet and small HTML pieces of the dashboard: one place decides how everything looks."""
+
+from __future__ import annotations
+
+from html import escape
+
+RGB = tuple[int, int, int]
+
+# Orange against blue stays apart for colour-blind readers; magenta and green mark what is rare.
+ESTIMATE: RGB = (249, 115, 22)
+TRUTH: RGB = (59, 130, 246)
+KEYFRAME: RGB = (120, 134, 156)
+WINDOW: RGB = (217, 70, 239)
+LOOP: RGB = (16, 185, 129)
+BEFORE: RGB = (239, 68, 68)
+OTHER: RGB = (20, 184, 166)
+ACCENT: RGB = (234, 88, 12)
+
+STATE_COLORS: dict[str, RGB] = {
+    "idle": KEYFRAME,
+    "initialising": TRUTH,
+    "tracking": LOOP,
+    "mapping": LOOP,
+    "lost": BEFORE,
+    "relocalising": ESTIMATE,
+    "paused": (234, 179, 8),
+    "finished": TRUTH,
+    "failed": BEFORE,
+}
+
+
+def css(color: RGB) -> str:
+    """An RGB triple as a CSS colour."""
+    return f"rgb({color[0]},{color[1]},{color[2]})"
+
+
+STYLE = """
+.mantine-Tabs-tab{padding:9px 10px;font-size:13px}
+.mantine-Button-root{border-radius:7px;font-weight:600}
+.mantine-Button-root[style*="gray-filled"]{--button-bg:transparent!important;--button-hover:rgba(128,128,128,.12)!important;
+  --button-color:var(--mantine-color-text)!important;border:1px solid var(--mantine-color-default-border)}
+.u-legend .u-series:first-child,.u-legend .u-value{display:none!important}
+.u-legend .u-label:after{display:none!important}
+.u-title{font-size:12.5px!important;font-weight:600}
+.ec{font-size:12.5px;line-height:1.45;color:var(--mantine-color-text);padding:4px 8px 6px;font-variant-numeric:tabular-nums}
+.ec b{font-weight:600}
+.ec .dim{color:var(--mantine-color-dimmed)}
+.ec-head{display:flex;align-items:center;gap:8px;margin-bottom:7px;min-width:0}
+.ec-chip{display:inline-flex;align-items:center;gap:6px;padding:2px 10px 2px 8px;border-radius:999px;font-weight:600;
+  font-size:12px;white-space:nowrap;color:var(--c);background:color-mix(in srgb,var(--c) 14%,transparent)}
+.ec-chip i{width:7px;height:7px;border-radius:50%;background:var(--c)}
+.ec-name{flex:1;min-width:0;text-align:right;overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
+.ec-bar{height:5px;border-radius:3px;background:var(--mantine-color-default-border);overflow:hidden;margin:3px 0 9px}
+.ec-bar i{display:block;height:100%;border-radius:3px;background:rgb(234,88,12)}
+.ec-row{display:flex;justify-content:space-between;gap:8px}
+.ec-grid{display:grid;margin-bottom:4px;grid-template-columns:repeat(3,minmax(0,1fr));gap:6px}
+.ec-cell{border:1px solid var(--mantine-color-default-border);border-radius:8px;padding:5px 8px 4px;min-width:0}
+.ec-cell b{display:block;font-size:15px;line-height:1.3;white-space:nowrap;letter-spacing:-.01em}
+.ec-cell span{font-size:10.5px;color:var(--mantine-color-dimmed);white-space:nowrap}
+.ec-cell small{font-size:10.5px;font-weight:500;color:var(--mantine-color-dimmed);margin-left:2px}
+.ec-note{margin:7px 0 0;padding:6px 9px;border-radius:8px;border-left:3px solid var(--c);
+  background:color-mix(in srgb,var(--c) 10%,transparent)}
+.ec table{width:100%;border-collapse:collapse}
+.ec td,.ec th{padding:3px 4px;text-align:right;border-bottom:1px solid var(--mantine-color-default-border);font-weight:400}
+.ec td:first-child,.ec th:first-child{text-align:left;color:var(--mantine-color-dimmed)}
+.ec th{font-weight:600}
+.ec-key{display:flex;flex-wrap:wrap;gap:3px 12px;font-size:11.5px;color:var(--mantine-color-dimmed)}
+.ec-key i{display:inline-block;width:14px;height:3px;border-radius:2px;margin-right:5px;vertical-align:middle;background:var(--c)}
+.ec-six{display:grid;grid-template-columns:1fr 1fr;gap:5px}
+.ec-six figure{margin:0;position:relative;border-radius:6px;overflow:hidden;background:#8884;aspect-ratio:4/3}
+.ec-six img{width:100%;height:100%;object-fit:cover;display:block}
+.ec-six figcaption{position:absolute;left:5px;bottom:4px;font-size:10px;padding:0 6px;border-radius:9px;color:#fff;background:#0009}
+"""
+
+
+def chip(text: str, color: RGB) -> str:
+    """A pill with a coloured dot."""
+    return f'<span class="ec-chip" style="--c:{css(color)}"><i></i>{escape(text)}</span>'
+
+
+def cell(value: str, unit: str, label: str) -> str:
+    """One figure with its unit and name."""
+    return f'<div class="ec-cell"><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(label)}</span></div>'
+
+
+def note(text: str, color: RGB) -> str:
+    """A paragraph with a coloured edge."""
+    return f'<div class="ec-note" style="--c:{css(color)}">{escape(text)}</div>'
+
+
+def legend(entries: list[tuple[str, RGB]]) -> str:
+    """What the colours in the scene mean."""
+    items = "".join(f'<span><i style="--c:{css(color)}"></i>{escape(name)}</span>' for name, color in entries)
+    return f'<div class="ec"><div class="ec-key">{items}</div></div>'
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A figure for people; a dash where there is none."""
+    return "–" if value is None or value != value else f"{value:.{digits}f}"
