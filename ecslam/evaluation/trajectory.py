@@ -1,0 +1,126 @@
+"""How far an estimated trajectory is from the true one: ATE and RPE (Sturm et al., IROS 2012), frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..se3 import inverse, rotation_angle_deg
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale * rotation @ x + translation. rotation: [3, 3]; translation: [3], metres."""
+
+    rotation: Floats
+    translation: Floats
+    scale: float = 1.0
+
+    def apply(self, points: NDArray[np.floating]) -> Floats:
+        """Move points [..., 3]."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def apply_to_poses(self, c2w: Floats) -> Floats:
+        """Move camera-to-world poses [..., 4, 4]; the result stays a rigid motion whatever the scale."""
+        out = c2w.copy()
+        out[..., :3, :3] = self.rotation @ c2w[..., :3, :3]
+        out[..., :3, 3] = self.apply(c2w[..., :3, 3])
+        return out
+
+
+IDENTITY = Similarity(np.eye(3), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Statistics of errors that are all >= 0."""
+
+    rmse: float
+    mean: float
+    median: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: Floats) -> Spread:
+        """Of at least one error [N]."""
+        rmse = np.sqrt(np.mean(errors**2))
+        return cls(float(rmse), float(errors.mean()), float(np.median(errors)), float(errors.max()))
+
+
+@dataclass(frozen=True)
+class AbsoluteError:
+    """Absolute trajectory error. cm: over the frames that count. errors_cm: [N], NaN for a frame that is left out.
+
+    left_out: frames without a finite pose on both sides. alignment: what was applied to the estimate.
+    """
+
+    cm: Spread
+    errors_cm: Floats
+    left_out: int
+    alignment: Similarity
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """Relative pose error between frames ``delta`` apart. left_out: pairs with a pose that is not finite."""
+
+    cm: Spread
+    deg: Spread
+    left_out: int
+
+
+def align_umeyama(source: Floats, target: Floats, *, with_scale: bool = False) -> Similarity:
+    """The motion that brings points [N, 3] closest to others [N, 3] in least squares (Umeyama, PAMI 1991); N >= 1.
+
+    Where the points leave it open (all on a line or at one place) it is one of the best motions.
+    """
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    a, b = source - source_mean, target - target_mean
+    u, singular, vt = np.linalg.svd(b.T @ a / len(a))
+    flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * flip) @ vt
+    variance = float((a**2).sum() / len(a))
+    scale = float((singular * flip).sum() / variance) if with_scale and variance > 0 else 1.0
+    return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)
+
+
+def absolute_error(
+    estimate: Floats, truth: Floats, *, align: bool = True, with_scale: bool = False
+) -> AbsoluteError | None:
+    """ATE of camera centres after alignment, in cm; None when no frame has both poses.
+
+    estimate, truth: [N, 4, 4] camera-to-world, metres. Frames whose pose is not finite on either side are left out of
+    the alignment and of the figures, and counted. with_scale: align the scale too (not done for RGB-D).
+    """
+    ok = _finite(estimate) & _finite(truth)
+    if not ok.any():
+        return None
+    source, target = estimate[ok, :3, 3], truth[ok, :3, 3]
+    alignment = align_umeyama(source, target, with_scale=with_scale) if align else IDENTITY
+    errors = np.full(len(ok), np.nan)
+    errors[ok] = 100 * np.linalg.norm(alignment.apply(source) - target, axis=1)
+    return AbsoluteError(Spread.of(errors[ok]), errors, int((~ok).sum()), alignment)
+
+
+def relative_error(estimate: Floats, truth: Floats, *, delta: int = 1) -> RelativeError | None:
+    """RPE over all pairs of frames (i, i + delta), in cm and degrees; None when there is no pair.
+
+    estimate, truth: [N, 4, 4] camera-to-world, metres. Needs no alignment. Per pair, not per second or per metre.
+    """
+    ok = _finite(estimate) & _finite(truth)
+    pairs = np.flatnonzero(ok[:-delta] & ok[delta:])
+    if not len(pairs):
+        return None
+    moved = [inverse(poses[pairs]) @ poses[pairs + delta] for poses in (truth, estimate)]
+    error = inverse(moved[0]) @ moved[1]
+    cm = 100 * np.linalg.norm(error[:, :3, 3], axis=1)
+    deg = rotation_angle_deg(moved[0], moved[1])
+    return RelativeError(Spread.of(cm), Spread.of(deg), len(ok) - delta - len(pairs))
+
+
+def _finite(poses: Floats) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(poses).all((1, 2)))
