@@ -196,8 +196,8 @@ class Control:
 
     # ---- for the engine thread ------------------------------------------------------------------------------------
 
-    def begin(self, config: Config, position: int, total: int) -> None:
-        """A run over ``total`` frames starts at ``position``."""
+    def begin(self, config: Config, total: int, position: int = 0) -> None:
+        """A run over ``total`` frames is about to start at ``position``; commands for it are taken from now on."""
         with self._changed:
             self.config = self._started_with = config
             self.position, self._total = position, total

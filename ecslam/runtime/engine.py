@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
@@ -38,7 +39,7 @@ class Engine:
 
     sequence: an opened one or an address for ``open_sequence``; frames: ``A:B:STEP``, "" = all. out: the run folder.
     sequences: addresses that ``Restart`` may ask for. checkpoint_every: frames between checkpoints, a kill costs at
-    most twice as many. Raises InputError when the sequence cannot be opened.
+    most twice as many. Raises InputError when the sequence cannot be opened or the folder not be written to.
     """
 
     def __init__(
@@ -57,20 +58,20 @@ class Engine:
     ) -> None:
         address = sequence if isinstance(sequence, str) else sequence.name
         opened = open_sequence(sequence) if isinstance(sequence, str) else sequence
-        self._plan = Plan(config, datasets.select_frames(opened, frames), address, frames, device, out)
+        plan = Plan(config, datasets.select_frames(opened, frames), address, frames, device, out)
         self._sequences = tuple(dict.fromkeys((address, *sequences)))
         self._given = {address: opened}
         self._open_sequence, self._make, self._checkpoint_every = open_sequence, make, checkpoint_every
-        self._resumed = resumed
         self._feed = Feed()
-        self._workshop = workshop = Workshop(self._feed)
-        self._control = Control(config, self._feed.publish, self._sequences, self.presets, lambda: workshop.waiting)
-        self._run: Run | None = None
-        self._thread: threading.Thread | None = None
-        self._progress: Callable[[Snapshot], None] = lambda snapshot: None
         self._next_snapshot = 0.0
+        self._progress: Callable[[Snapshot], None] = lambda snapshot: None
+        self._thread: threading.Thread | None = None
         self.summary: dict[str, Any] | None = None
         self.error: Exception | None = None
+        self._plan, self._run = plan, self._open_run(plan, resumed)
+        self._workshop = workshop = Workshop(self._feed)
+        self._control = Control(config, self._feed.publish, self._sequences, self.presets, lambda: workshop.waiting)
+        self._control.begin(config, len(plan.sequence), self._run.tally.position)
 
     @classmethod
     def resume(cls, folder: Path, *, sequence: Sequence | None = None, **options: Any) -> Engine:
@@ -147,7 +148,7 @@ class Engine:
                 else:
                     turn = self._control.next_turn(0.0)
                     if turn is Turn.WORK:
-                        self._work()
+                        self._work(self._run)
         finally:
             self._control.quit()
             self._workshop.close()
@@ -155,50 +156,59 @@ class Engine:
     def _restart(self) -> Turn:
         command, config = self._control.take_restart()
         plan = replace(self._plan, config=config, out=_beside(self._plan.out))
+        self.error = self.summary = None
         try:
             if command.sequence is not None and command.sequence != plan.address:
                 opened = self._given.get(command.sequence) or self._open_sequence(command.sequence)
                 plan = replace(plan, sequence=opened, address=command.sequence, frames="")
-        except InputError as error:
-            self._control.begin(self._plan.config, 0, 0)
+            self._control.begin(config, len(plan.sequence))
+            self._plan, self._run = plan, self._open_run(plan)
+        except (InputError, OSError) as error:
+            self._control.begin(config, 0)
             self._control.end()
-            self._fail(error)
+            self._failed(error)
+            self._show(State.FAILED, str(error))
             return Turn.STOP
-        self._plan, self._resumed = plan, None
         return self._one_run()
 
     # ---- one run --------------------------------------------------------------------------------------------------
 
-    def _one_run(self) -> Turn:
-        """From the first frame to the summary; what ended it."""
-        self.error = self.summary = self._run = None
-        position = self._resumed.frame if self._resumed else 0
-        self._control.begin(self._plan.config, position, len(self._plan.sequence))
-        self._workshop.begin(lambda: self._control.quitting)
-        turn = Turn.STOP
-        try:
-            self._run = run = self._open_run()
-            self._show(run.state())
-            todo = range(position, len(self._plan.sequence))
-            frames = datasets.prefetch(self._plan.sequence, todo)
-            try:
-                turn = self._frames(run, frames)
-            finally:
-                frames.close()  # type: ignore[attr-defined]
-        except Exception as error:
-            self._fail(error)
-        self._control.end()
-        if self._run is not None:
-            self._end(self._run, turn)
-        return turn
-
-    def _open_run(self) -> Run:
-        plan = self._plan
-        if self._resumed is None:
+    def _open_run(self, plan: Plan, resumed: Checkpoint | None = None) -> Run:
+        if resumed is None:
             folder = RunFolder.create(plan.out, self._not_saved)
         else:
-            folder = RunFolder.reopen(plan.out, self._resumed.frame, self._not_saved)
-        return Run(plan, folder, self._feed.publish, self._make, self._checkpoint_every, self._resumed)
+            folder = RunFolder.reopen(plan.out, resumed.frame, self._not_saved)
+        return Run(plan, folder, self._feed.publish, self._make, self._checkpoint_every, resumed)
+
+    def _one_run(self) -> Turn:
+        """From the first frame to the summary; what ended it."""
+        run, turn = self._run, Turn.STOP
+        self._workshop.begin(lambda: self._control.quitting)
+        self._show(run.state())
+        frames = datasets.prefetch(run.plan.sequence, range(run.tally.position, len(run.plan.sequence)))
+        try:
+            with closing(frames):  # type: ignore[type-var]
+                turn = self._frames(run, frames)
+        except Exception as error:
+            self._failed(error)
+        self._control.end()
+        try:
+            self._finish(run, turn is Turn.STOP and self.error is None)
+        except Exception as error:
+            self._failed(error)
+        if self.error is not None:
+            self._show(State.FAILED, _words(self.error))
+        elif turn is Turn.STOP:
+            self._show(State.FINISHED)
+        return turn
+
+    def _finish(self, run: Run, complete: bool) -> None:
+        """Final poses, mesh, summary; an incomplete run ends without the last mapping and without the mesh."""
+        run.end(complete)
+        began = monotonic()
+        if complete:
+            self._workshop.final(run, self._control)
+        self.summary = run.close(monotonic() - began)
 
     def _frames(self, run: Run, frames: Items) -> Turn:
         """Step through the frames as the commands want it; what ended that (STOP also at the sequence's end)."""
@@ -218,13 +228,14 @@ class Engine:
                 run.measure()
                 self._show(State.PAUSED)
             elif turn is Turn.WORK:
-                self._work()
+                self._work(run)
             elif turn is not Turn.STEP:
                 return turn
             else:
                 last_step = monotonic()
                 item = next(frames, None)
                 if item is None:
+                    run.require_frames()
                     return Turn.STOP
                 self._step(run, item, interrupt)
 
@@ -239,42 +250,19 @@ class Engine:
         if monotonic() >= self._next_snapshot:
             self._show(run.state())
 
-    def _end(self, run: Run, turn: Turn) -> None:
-        """Final poses, mesh, summary. A restart or the end of the engine takes no time for mapping and meshing."""
-        complete = turn is Turn.STOP and self.error is None
-        try:
-            run.end(complete)
-            began = monotonic()
-            if complete:
-                self._workshop.final(run, self._control)
-            self.summary = run.close(monotonic() - began)
-        except Exception as error:
-            self._fail(error)
-        if complete and self.error is None:
-            self._show(State.FINISHED)
-
-    def _fail(self, error: Exception) -> None:
-        self.error = error
-        text = str(error) or type(error).__name__
-        if self._run is not None:
-            self._run.notice("error", text)
-            self._show(State.FAILED, text)
-        else:
-            self._feed.publish(Notice("error", text))
+    def _failed(self, error: Exception) -> None:
+        self.error = self.error or error
+        self._run.notice("error", _words(error))
 
     def _show(self, state: State, reason: str = "") -> None:
-        assert self._run is not None
         self._next_snapshot = monotonic() + SNAPSHOT_PERIOD_S
         snapshot = self._run.snapshot(state, reason)
         self._feed.publish(snapshot)
         self._progress(snapshot)
 
-    def _work(self) -> None:
+    def _work(self, run: Run) -> None:
         """Take up what waits, at a frame boundary."""
-        run, orders = self._run, self._control.take_work()
-        if run is None:
-            self._feed.publish(Notice("error", "there is no run; restart it"))
-            return
+        orders = self._control.take_work()
         for _, command in orders:
             if isinstance(command, (Tune, LoadPreset)):
                 run.configure(self._control.config)
@@ -289,6 +277,10 @@ class Engine:
 
     def _not_saved(self, text: str) -> None:
         self._feed.publish(Notice("error", text))
+
+
+def _words(error: Exception) -> str:
+    return str(error) or type(error).__name__
 
 
 def _beside(folder: Path) -> Path:

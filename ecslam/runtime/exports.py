@@ -8,12 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .. import config as configuration
+from ..evaluation.trajectory_io import format_kitti, format_tum
 from ..messages import Event, Export, Exported, FramePictures, Notice
 from ..types import InputError
 from .mesh_files import mesh_bytes
 from .meshjobs import FrozenMap, build_mesh
 from .pictures import shrink, shrink_depth, six_pictures
-from .poses import kitti_text, tum_text
 from .run import Run
 
 PICTURE_WIDTH = 160
@@ -64,7 +64,7 @@ def _maker(
     if export.kind == "keyframes":
         kept = [run.tally.rows.index(frame) for frame in run.tally.keyframes]
         times, poses = times[kept], poses[kept]
-    return (lambda: kitti_text(poses)) if export.format == "kitti" else (lambda: tum_text(times, poses))
+    return (lambda: format_kitti(poses)) if export.format == "kitti" else (lambda: format_tum(times, poses))
 
 
 def zip_run(folder: Path, name: str) -> Path:

@@ -66,8 +66,7 @@ class JobThread:
         self._changed = threading.Condition()
         self._jobs: deque[Callable[[], None]] = deque()
         self._busy = self._closed = False
-        self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
-        self._thread.start()
+        self._thread: threading.Thread | None = None
 
     @property
     def waiting(self) -> int:
@@ -80,10 +79,13 @@ class JobThread:
         return self._closed
 
     def submit(self, job: Callable[[], None]) -> None:
-        """Queue a job. Jobs submitted after ``close`` are not done."""
+        """Queue a job; the first one starts the thread. Jobs submitted after ``close`` are not done."""
         with self._changed:
             self._jobs.append(job)
             self._changed.notify_all()
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+                self._thread.start()
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Drop waiting jobs, ask the one at work to end, and wait for it at most ``timeout_s``."""
@@ -91,7 +93,8 @@ class JobThread:
             self._closed = True
             self._jobs.clear()
             self._changed.notify_all()
-        self._thread.join(timeout_s)
+        if self._thread is not None:
+            self._thread.join(timeout_s)
 
     def _work(self) -> None:
         while True:

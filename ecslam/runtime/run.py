@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from .. import config as configuration
 from ..config import Config
+from ..evaluation.trajectory import Spread, absolute_error
+from ..evaluation.trajectory_io import format_tum
 from ..messages import Event, KeyframeView, LoopEvent, Notice, Snapshot, State, StepReport
+from ..se3 import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
-from .accuracy import Ate, ate, pose_error
 from .checkpoint import Checkpoint, CheckpointWriter
 from .driven import SlamFactory, SlamLike
 from .driven import State as Arrays
 from .meshjobs import FrozenMap
 from .pictures import shrink
-from .poses import tum_text
 from .runfolder import RunFolder
 from .summary import summarise
 from .tally import Stopwatch, Tally, peak_memory_mb
@@ -63,7 +64,7 @@ class Run:
         self.truth = plan.sequence.poses_gt()
         self.torn = False
         self.report: StepReport | None = None
-        self.ate: Ate | None = None
+        self.ate_cm: Spread | None = None
         self.loops: list[LoopEvent] = []
         self._emit, self._make, self._checkpoint_every = emit, make, checkpoint_every
         self._checkpoints = CheckpointWriter(
@@ -96,7 +97,7 @@ class Run:
         self.folder.write("config.yaml", configuration.to_yaml(self.config))
         if self.truth is not None:
             known = np.isfinite(self.truth).all((1, 2))
-            self.folder.write("groundtruth.txt", tum_text(s.timestamps()[known], self.truth[known]))
+            self.folder.write("groundtruth.txt", format_tum(s.timestamps()[known], self.truth[known]))
 
     # ---- frames ---------------------------------------------------------------------------------------------------
 
@@ -148,13 +149,13 @@ class Run:
         truth = None if self.truth is None else self.truth[loop.frame]
         if truth is None or loop.c2w_before is None or not np.isfinite(truth).all():
             return loop
-        (cm_before, deg_before), (cm_after, deg_after) = pose_error(loop.c2w_before, truth), pose_error(after, truth)
+        before = loop.c2w_before
         return replace(
             loop,
-            error_before_cm=cm_before,
-            error_after_cm=cm_after,
-            rotation_error_before_deg=deg_before,
-            rotation_error_after_deg=deg_after,
+            error_before_cm=100 * float(np.linalg.norm(before[:3, 3] - truth[:3, 3])),
+            error_after_cm=100 * float(np.linalg.norm(after[:3, 3] - truth[:3, 3])),
+            rotation_error_before_deg=float(rotation_angle_deg(before, truth)),
+            rotation_error_after_deg=float(rotation_angle_deg(after, truth)),
         )
 
     def _skip(self, index: int, why: str) -> None:
@@ -167,6 +168,12 @@ class Run:
                 f"{bad[0]}; look at it with: ecslam check"
             )
 
+    def require_frames(self) -> None:
+        """Raises InputError when no frame so far could be used."""
+        if not self.tally.rows:
+            why = "; ".join(self.tally.unreadable[:1]) or "they do not move on in time"
+            raise InputError(f"{self.plan.address}: none of {self.tally.position} frames could be used ({why})")
+
     def _record(self, report: StepReport, frame: Frame) -> None:
         self.tally.add(report)
         self.report = report
@@ -176,7 +183,7 @@ class Run:
         if report.is_keyframe:
             self._thumbnails[report.frame] = shrink(frame.color, THUMBNAIL_WIDTH)
             self.folder.keyframe(report.frame, report.c2w, self._thumbnails[report.frame])
-        self.folder.metrics(report, self.ate.rmse_cm if self.ate else None)
+        self.folder.metrics(report, self.ate_cm.rmse if self.ate_cm else None)
         if report.loop is not None:
             self.loops.append(report.loop)
             self.folder.event(report.loop)
@@ -214,7 +221,8 @@ class Run:
 
     def measure(self) -> None:
         """Bring the ATE up to date."""
-        self.ate = None if self.truth is None else ate(self.poses(), self.truth[self.tally.rows])
+        error = None if self.truth is None else absolute_error(self.poses(), self.truth[self.tally.rows])
+        self.ate_cm = error.cm if error else None
 
     def freeze(self) -> FrozenMap | None:
         """The map as it is now, for the job thread; None before there is one."""
@@ -263,7 +271,7 @@ class Run:
             map_ms=report.map_ms if report else 0.0,
             fps_wall=len(self.tally.rows) / seconds if seconds else 0.0,
             fps_engine=self.tally.fps_engine,
-            ate_cm=self.ate.rmse_cm if self.ate else None,
+            ate_cm=self.ate_cm.rmse if self.ate_cm else None,
             memory_mb=peak_memory_mb(),
             loops=tuple(self.loops),
             skipped=self.tally.skipped,
@@ -289,7 +297,7 @@ class Run:
 
     def write_trajectory(self) -> None:
         """Bring ``trajectory.txt`` up to date."""
-        self.folder.write("trajectory.txt", tum_text(self.timestamps(), self.poses()))
+        self.folder.write("trajectory.txt", format_tum(self.timestamps(), self.poses()))
 
     def end(self, complete: bool) -> None:
         """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock."""

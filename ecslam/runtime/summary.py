@@ -15,7 +15,7 @@ def summarise(run: Run, export_s: float) -> dict[str, Any]:
 
     ``ecslam eval`` adds the figures that need a reference mesh.
     """
-    tally, slam, ate = run.tally, run.slam, run.ate
+    tally, slam, ate = run.tally, run.slam, run.ate_cm
     parameters = slam.field.parameters if slam is not None and slam.field is not None else 0
     return {
         "sequence": run.plan.sequence.name,
@@ -29,9 +29,9 @@ def summarise(run: Run, export_s: float) -> dict[str, Any]:
         "wall_s": round(tally.wall_s, 3),
         "fps_wall": round(tally.fps_wall, 3),
         "fps_engine": round(tally.fps_engine, 3),
-        "ate_rmse_cm": ate.rmse_cm if ate else None,
-        "ate_mean_cm": ate.mean_cm if ate else None,
-        "ate_max_cm": ate.max_cm if ate else None,
+        "ate_rmse_cm": ate.rmse if ate else None,
+        "ate_mean_cm": ate.mean if ate else None,
+        "ate_max_cm": ate.max if ate else None,
         "parameters": parameters,
         "parameters_mb": round(parameters * 4 / 1e6, 3),
         "peak_memory_mb": round(peak_memory_mb(), 1),

@@ -73,11 +73,11 @@ class Tally:
 
 
 class Stopwatch:
-    """Seconds since ``start``, without those between ``pause`` and ``resume``."""
+    """Seconds between each ``resume`` and ``pause``; it begins paused."""
 
     def __init__(self, already_s: float = 0.0) -> None:
         self._total_s = already_s
-        self._since: float | None = monotonic()
+        self._since: float | None = None
 
     @property
     def seconds(self) -> float:

@@ -1,0 +1,117 @@
+"""Checkpoints: round trip, two generations, every kind of damage falls back or is refused, nothing half-written."""
+
+import errno
+import os
+
+import numpy as np
+import pytest
+
+from ecslam.runtime.checkpoint import Checkpoint, CheckpointWriter, load_checkpoint, save_checkpoint
+from ecslam.types import InputError
+
+ARRAYS = {
+    "scalar": np.array(3.5),
+    "bool": np.array([True, False]),
+    "bytes": np.arange(200, dtype=np.uint8),
+    "turned": np.arange(12, dtype=np.int64).reshape(3, 4).T,
+    "none": np.zeros((0, 4, 4)),
+}
+
+
+def checkpoint(frame: int) -> Checkpoint:
+    return Checkpoint(frame, ARRAYS | {"frame": np.array(frame)}, {"tally": {"wall_s": 1.5}, "name": "ü"})
+
+
+def test_round_trip_keeps_every_bit(tmp_path):
+    save_checkpoint(tmp_path, checkpoint(7))
+    back = load_checkpoint(tmp_path)
+    assert (back.frame, back.meta) == (7, checkpoint(7).meta)
+    for name, value in checkpoint(7).arrays.items():
+        assert back.arrays[name].dtype == value.dtype
+        assert np.array_equal(back.arrays[name], value)
+        assert back.arrays[name].shape == value.shape
+
+
+def test_the_newest_two_generations_are_kept(tmp_path):
+    for frame in (5, 10, 15, 20):
+        save_checkpoint(tmp_path, checkpoint(frame))
+        assert load_checkpoint(tmp_path).frame == frame
+    names = sorted(os.listdir(tmp_path))
+    assert names == ["000015.json", "000015.safetensors", "000020.json", "000020.safetensors"]
+
+
+def flip(path, position):
+    data = bytearray(path.read_bytes())
+    data[position % len(data)] ^= 4
+    path.write_bytes(data)
+
+
+DAMAGE = {
+    "flipped array": lambda folder: flip(folder / "000010.safetensors", -3),
+    "flipped header": lambda folder: flip(folder / "000010.safetensors", 12),
+    "flipped manifest": lambda folder: flip(folder / "000010.json", 200),
+    "truncated arrays": lambda folder: os.truncate(folder / "000010.safetensors", 50),
+    "empty manifest": lambda folder: os.truncate(folder / "000010.json", 0),
+    "missing arrays": lambda folder: (folder / "000010.safetensors").unlink(),
+    "other json": lambda folder: (folder / "000010.json").write_text("[1, 2]"),
+    "pickle": lambda folder: (folder / "000010.safetensors").write_bytes(b"\x80\x04cos\nsystem\n"),
+    "huge manifest": lambda folder: os.truncate(folder / "000010.json", 1 << 30),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
+def test_a_damaged_newest_generation_falls_back_to_the_older(tmp_path, damage):
+    save_checkpoint(tmp_path, checkpoint(5))
+    save_checkpoint(tmp_path, checkpoint(10))
+    damage(tmp_path)
+    assert load_checkpoint(tmp_path).frame == 5
+
+
+def test_every_flipped_byte_of_the_manifest_is_noticed(tmp_path):
+    save_checkpoint(tmp_path, checkpoint(5))
+    path = tmp_path / "000005.json"
+    whole = path.read_bytes()
+    for position in range(len(whole)):
+        flip(path, position)
+        with pytest.raises(InputError, match="no usable checkpoint"):
+            load_checkpoint(tmp_path)
+        path.write_bytes(whole)
+    assert load_checkpoint(tmp_path).frame == 5
+
+
+def test_no_whole_generation_is_one_clear_line(tmp_path):
+    with pytest.raises(InputError, match="no usable checkpoint"):
+        load_checkpoint(tmp_path / "nowhere")
+    for frame in (5, 10):
+        save_checkpoint(tmp_path, checkpoint(frame))
+        flip(tmp_path / f"{frame:06d}.safetensors", -1)
+    with pytest.raises(InputError, match=r"000010.json: the arrays do not match.*000005.json") as caught:
+        load_checkpoint(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_full_disk_is_reported_and_the_older_generations_stay(tmp_path, monkeypatch):
+    failures, saved = [], []
+    writer = CheckpointWriter(tmp_path, failures.append, lambda: saved.append(1))
+    writer.save(checkpoint(5))
+    writer.wait()
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        writer.save(checkpoint(10))
+        writer.wait()
+    assert [f.errno for f in failures] == [errno.ENOSPC]
+    assert load_checkpoint(tmp_path).frame == 5
+    writer.save(checkpoint(15))
+    writer.wait()
+    assert load_checkpoint(tmp_path).frame == 15
+    assert len(saved) == 2
+
+
+def test_leftovers_of_a_killed_writer_are_removed(tmp_path):
+    (tmp_path / ".000005.safetensors.12-34.tmp").write_bytes(b"half")
+    CheckpointWriter(tmp_path, print, print)
+    assert os.listdir(tmp_path) == []

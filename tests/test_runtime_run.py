@@ -1,0 +1,208 @@
+"""A whole run: what it writes, what it counts, and what it does about bad frames, full disks and failures."""
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from fake_slam import Behaviour, FakeSequence, circle, maker, open_fake
+from runtime_watch import running
+
+from ecslam.config import Config, load_config
+from ecslam.evaluation.trajectory import absolute_error
+from ecslam.messages import Notice, Resume, Snapshot, SpeedLimit, State
+from ecslam.runtime.engine import Engine
+from ecslam.runtime.files import read_lines
+from ecslam.runtime.tally import Tally
+from ecslam.types import InputError
+
+SUMMARY_KEYS = """
+    sequence preset device kernels seed frames keyframes wall_s fps_wall fps_engine ate_rmse_cm ate_mean_cm ate_max_cm
+    parameters parameters_mb peak_memory_mb skipped_frames lost_frames loop_closures
+    kernels_note unreadable_frames export_s not_saved
+"""
+
+
+def engine(out: Path, sequence=None, behaviour: Behaviour | None = None, **options) -> Engine:
+    options = {"make": maker(behaviour), "open_sequence": open_fake} | options
+    return Engine(options.pop("config", Config()), sequence or FakeSequence(), out, **options)
+
+
+def run(out: Path, sequence=None, behaviour: Behaviour | None = None, **options) -> dict:
+    return engine(out, sequence, behaviour, **options).run()
+
+
+def test_the_run_folder_is_complete(tmp_path):
+    config = Config(seed=3, preset="lite")
+    summary = run(tmp_path / "deep/run", config=config)
+    out = tmp_path / "deep/run"
+    assert sorted(summary) == sorted(SUMMARY_KEYS.split())
+    assert json.loads((out / "summary.json").read_text()) == summary
+    assert load_config(out / "config.yaml") == config
+    metrics = list(read_lines(out / "metrics.jsonl"))
+    assert [m["frame"] for m in metrics] == list(range(30))
+    keys = "frame timestamp c2w tracked lost keyframe window losses track_ms map_ms ate_cm"
+    assert sorted(metrics[0]) == sorted(keys.split())
+    assert np.array(metrics[4]["c2w"]).shape == (12,)
+    trajectory = np.loadtxt(out / "trajectory.txt")
+    assert np.array_equal(trajectory[:, 0], np.arange(30) / 30)
+    assert np.allclose(trajectory[:, 1:4], [np.reshape(m["c2w"], (3, 4))[:, 3] for m in metrics], atol=1e-8)
+    assert np.allclose(np.loadtxt(out / "groundtruth.txt")[:, 1:4], circle(30)[:, :3, 3], atol=1e-8)
+    keyframes = list(read_lines(out / "keyframes.jsonl"))
+    assert [k["frame"] for k in keyframes] == [0, 5, 10, 15, 20, 25]
+    assert all((out / k["thumbnail"]).stat().st_size > 100 for k in keyframes)
+    assert trimesh.load(out / "mesh.ply").bounds.max() == pytest.approx(1, abs=0.02)
+    assert 2 <= len(list((out / "meshes").glob("*.ply"))) <= 9
+    about = json.loads((out / "run.json").read_text())
+    assert (about["sequence"], about["frames_total"], about["fx"]) == ("fake", 30, 60.0)
+
+
+def test_the_figures_are_what_they_say(tmp_path):
+    summary = run(tmp_path, behaviour=Behaviour(lost=(7, 8), loop_at=20))
+    assert (summary["frames"], summary["keyframes"], summary["loop_closures"], summary["lost_frames"]) == (30, 6, 1, 2)
+    assert summary["fps_engine"] == pytest.approx(1e3 / 5)  # 2 + 3 ms a frame, the first one's 100 ms left out
+    assert summary["fps_wall"] == pytest.approx(30 / summary["wall_s"], rel=0.02)
+    estimate = np.loadtxt(tmp_path / "trajectory.txt")[:, 1:4]
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, :3, 3] = estimate
+    assert absolute_error(poses, circle(30)).cm.rmse == pytest.approx(summary["ate_rmse_cm"])
+    assert summary["ate_mean_cm"] <= summary["ate_rmse_cm"] <= summary["ate_max_cm"]
+
+
+def test_without_ground_truth_there_is_no_ate(tmp_path):
+    summary = run(tmp_path, FakeSequence(12, truth=False))
+    assert summary["ate_rmse_cm"] is summary["ate_mean_cm"] is summary["ate_max_cm"] is None
+    assert not (tmp_path / "groundtruth.txt").exists()
+    assert np.allclose(np.loadtxt(tmp_path / "trajectory.txt")[0, 1:4], 0, atol=0.03)
+
+
+def test_the_same_run_twice_gives_the_same_bytes(tmp_path):
+    run(tmp_path / "a")
+    run(tmp_path / "b")
+    assert (tmp_path / "a/trajectory.txt").read_bytes() == (tmp_path / "b/trajectory.txt").read_bytes()
+
+
+def test_unreadable_frames_are_skipped_counted_and_named(tmp_path):
+    summary = run(tmp_path, FakeSequence(30, bad=(0, 4, 21)))
+    assert (summary["frames"], summary["skipped_frames"]) == (27, 3)
+    assert summary["unreadable_frames"][1] == "/data/000004.png: truncated; copy it again"
+    assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 27
+    skipped = [e["frame"] for e in read_lines(tmp_path / "events.jsonl") if "skipped" in e["text"]]
+    assert skipped == [0, 4, 21]
+
+
+def test_over_a_fifth_of_unreadable_frames_ends_the_run_and_keeps_what_there_is(tmp_path):
+    with pytest.raises(InputError, match=r"fake: 3 of 14 frames cannot be read.*000002.png.*ecslam check"):
+        run(tmp_path, FakeSequence(40, bad=(2, 12, 13, 14, 15)))
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 11
+    assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 11
+    summary = run(tmp_path, FakeSequence(40, bad=(2, 12, 20, 25, 30, 31)))
+    assert summary["skipped_frames"] == 6
+
+
+def test_a_sequence_without_a_usable_frame_is_an_error(tmp_path):
+    with pytest.raises(InputError, match=r"fake: none of 4 frames could be used.*000000.png"):
+        run(tmp_path, FakeSequence(4, bad=(0, 1, 2, 3)))
+
+
+def test_an_early_bad_stretch_does_not_end_the_run_before_ten_frames(tmp_path):
+    assert run(tmp_path, FakeSequence(20, bad=(0, 1)))["frames"] == 18
+
+
+def test_repeated_and_backward_time_stamps_are_skipped(tmp_path):
+    times = np.arange(20) / 10
+    times[5], times[9], times[10] = times[4], 0.1, times[8]
+    summary = run(tmp_path, FakeSequence(20, times=times))
+    assert (summary["frames"], summary["skipped_frames"], summary["unreadable_frames"]) == (17, 3, [])
+    written = np.loadtxt(tmp_path / "trajectory.txt")[:, 0]
+    assert (np.diff(written) > 0).all()
+
+
+def test_snapshots_keep_a_row_for_each_frame_and_say_lost(tmp_path):
+    sequence = FakeSequence(12, bad=(4,))
+    with running(tmp_path, sequence, Behaviour(lost=(6, 7)), paused_at=0) as (handle, watch, _):
+        handle.submit(SpeedLimit(20.0))
+        handle.submit(Resume())
+        last = watch.state(State.FINISHED)
+        states = {m.frame: m.state for m in watch.seen if isinstance(m, Snapshot)}
+    assert last.trajectory.shape == (12, 4, 4)
+    assert np.array_equal(last.trajectory[4], last.trajectory[3])
+    assert (last.skipped, last.lost_frames, last.frames_total) == (1, 2, 12)
+    assert states[6] is State.LOST
+    assert states[7] is State.RELOCALISING
+    assert states[8] is State.TRACKING
+    assert states[10] is State.MAPPING
+    assert [k.frame for k in last.keyframes] == [0, 5, 10]
+    assert np.array_equal(last.keyframes[1].c2w, last.trajectory[5])
+
+
+def test_progress_sees_the_run(tmp_path):
+    seen = []
+    engine(tmp_path).run(seen.append)
+    assert seen[0].state is State.INITIALISING
+    assert seen[-1].state is State.FINISHED
+    assert seen[-1].ate_cm is not None
+
+
+def test_a_full_disk_does_not_end_the_run(tmp_path, monkeypatch):
+    handle = engine(tmp_path)
+    notices = handle.subscribe()
+    real = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        name = os.readlink(f"/proc/self/fd/{descriptor}")
+        if name.endswith(".tmp") and "summary" not in name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    summary = handle.run()
+    assert summary["frames"] == 30
+    assert {"mesh.ply", "trajectory.txt", "checkpoints"} <= set(summary["not_saved"])
+    assert not list(tmp_path.rglob("*.tmp"))
+    said = [m.text for m in iter(lambda: notices.get(0.0), None) if isinstance(m, Notice)]
+    assert sum("mesh.ply could not be saved" in text for text in said) == 1
+    assert sum("checkpoints could not be saved" in text for text in said) == 1
+
+
+def test_an_unusable_folder_is_refused_before_the_run(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds other files and no run"):
+        engine(tmp_path)
+
+
+def test_a_failure_in_the_engine_proper_is_told_and_keeps_the_poses(tmp_path):
+    with running(tmp_path, behaviour=Behaviour(fail_at=8)) as (handle, watch, _):
+        assert watch.state(State.FAILED).reason == "the map exploded"
+        assert isinstance(handle.error, RuntimeError)
+    assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 8
+    with pytest.raises(RuntimeError, match="exploded"):
+        run(tmp_path, behaviour=Behaviour(fail_at=8))
+
+
+def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
+    whole = run(tmp_path / "whole", behaviour=Behaviour(lost=(3,)))
+    with running(tmp_path / "cut", FakeSequence(30), Behaviour(lost=(3,)), paused_at=18):
+        pass
+    made = maker()
+    resumed = Engine.resume(tmp_path / "cut", sequence=FakeSequence(30), make=made).run()
+    assert made.made[0].trajectory.timestamps[17] == pytest.approx(17 / 30)
+    same = ("frames", "keyframes", "lost_frames", "ate_rmse_cm", "seed")
+    assert {k: resumed[k] for k in same} == {k: whole[k] for k in same}
+    for name in ("trajectory.txt", "groundtruth.txt"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    for name in ("metrics.jsonl", "keyframes.jsonl"):
+        frames = [[m["frame"] for m in read_lines(tmp_path / run / name)] for run in ("cut", "whole")]
+        assert frames[0] == frames[1]
+    with pytest.raises(InputError, match="is finished"):
+        Engine.resume(tmp_path / "cut", sequence=FakeSequence(30))
+    with pytest.raises(InputError, match="no usable checkpoint"):
+        Engine.resume(tmp_path / "none")
+
+
+def test_the_row_of_a_skipped_frame_is_the_one_before():
+    tally = Tally(position=7, rows=[1, 2, 5])
+    assert tally.row_of_each_frame().tolist() == [0, 0, 1, 1, 1, 2, 2]
