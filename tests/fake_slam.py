@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ecslam.config import Config
+from ecslam.config import Config, FieldConfig
 from ecslam.messages import LoopEvent, StepReport
 from ecslam.types import Frame, FrameError, InputError, Intrinsics
 
+QUICK = Config(field=FieldConfig(finest_voxel_m=0.1))
 CAMERA = Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48)
 
 

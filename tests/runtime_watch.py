@@ -6,9 +6,8 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-from fake_slam import Behaviour, FakeSequence, maker, open_fake
+from fake_slam import QUICK, Behaviour, FakeSequence, maker, open_fake
 
-from ecslam.config import Config
 from ecslam.messages import Ack, Pause, Quit, RunTo, Snapshot, State
 from ecslam.runtime.engine import Engine
 
@@ -59,7 +58,7 @@ class Watch:
 def running(out: Path, sequence=None, behaviour: Behaviour | None = None, paused_at: int | None = None, **options):
     """A started engine and its watch; with ``paused_at`` it waits before that frame."""
     make = maker(behaviour)
-    config = options.pop("config", Config())
+    config = options.pop("config", QUICK)
     engine = Engine(config, sequence or FakeSequence(), out, make=make, open_sequence=open_fake, **options)
     watch = Watch(engine)
     if paused_at is not None:

@@ -2,10 +2,12 @@
 
 import errno
 import os
+import threading
 
 import numpy as np
 import pytest
 
+from ecslam.runtime import checkpoint as module
 from ecslam.runtime.checkpoint import Checkpoint, CheckpointWriter, load_checkpoint, save_checkpoint
 from ecslam.types import InputError
 
@@ -92,7 +94,7 @@ def test_no_whole_generation_is_one_clear_line(tmp_path):
 
 def test_a_full_disk_is_reported_and_the_older_generations_stay(tmp_path, monkeypatch):
     failures, saved = [], []
-    writer = CheckpointWriter(tmp_path, failures.append, lambda: saved.append(1))
+    writer = CheckpointWriter(tmp_path, 5, failures.append, lambda: saved.append(1))
     writer.save(checkpoint(5))
     writer.wait()
 
@@ -113,5 +115,24 @@ def test_a_full_disk_is_reported_and_the_older_generations_stay(tmp_path, monkey
 
 def test_leftovers_of_a_killed_writer_are_removed(tmp_path):
     (tmp_path / ".000005.safetensors.12-34.tmp").write_bytes(b"half")
-    CheckpointWriter(tmp_path, print, print)
+    CheckpointWriter(tmp_path, 5, print, print)
     assert os.listdir(tmp_path) == []
+
+
+def test_a_slow_disk_costs_at_most_twice_the_period_and_no_waiting_before(tmp_path, monkeypatch):
+    finish = threading.Event()
+    real = module.save_checkpoint
+    monkeypatch.setattr(module, "save_checkpoint", lambda *args: (finish.wait(), real(*args)))
+    writer = CheckpointWriter(tmp_path, 5, print, lambda: None)
+    assert writer.due(1)
+    finish.set()
+    writer.save(checkpoint(1))
+    writer.wait()
+    assert [f for f in range(2, 7) if writer.due(f)] == [6]
+    finish.clear()
+    writer.save(checkpoint(6))
+    assert [f for f in range(7, 12) if writer.due(f)] == [11]
+    finish.set()
+    writer.save(checkpoint(11))
+    writer.wait()
+    assert load_checkpoint(tmp_path).frame == 11

@@ -105,6 +105,7 @@ def test_a_mesh_comes_within_five_seconds_even_during_the_first_mapping(tmp_path
         ready = watch.event(MeshReady)
         assert time.monotonic() - started < 5
         assert len(ready.mesh.faces) > 100
+        assert watch.until(lambda m: isinstance(m, Snapshot) and m.color is not None).state is State.INITIALISING
         radius = np.linalg.norm(ready.mesh.vertices, axis=1)
         assert np.abs(radius - 1).max() < 0.05
         assert watch.ask(RequestMesh(0.2)).error == ""

@@ -15,11 +15,12 @@ from ecslam.runtime.checkpoint import load_checkpoint
 from ecslam.runtime.engine import Engine
 from ecslam.runtime.files import read_lines
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = """
 import sys
 from pathlib import Path
-from fake_slam import Behaviour, FakeSequence, maker
-from ecslam.config import Config
+from fake_slam import QUICK, Behaviour, FakeSequence, maker
 from ecslam.runtime.checkpoint import load_checkpoint
 from ecslam.runtime.engine import Engine
 from ecslam.runtime.signals import quit_on_signals
@@ -30,7 +31,7 @@ sequence = FakeSequence(100_000)
 if (out / "checkpoints").is_dir():
     engine = Engine.resume(out, sequence=sequence, make=make)
 else:
-    engine = Engine(Config(), sequence, out, make=make)
+    engine = Engine(QUICK, sequence, out, make=make)
 with quit_on_signals(engine):
     engine.run(lambda snapshot: print(snapshot.frame, flush=True))
 print("saved", flush=True)

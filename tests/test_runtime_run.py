@@ -3,17 +3,19 @@
 import errno
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from fake_slam import Behaviour, FakeSequence, circle, maker, open_fake
+from fake_slam import QUICK, Behaviour, FakeSequence, circle, maker, open_fake
 from runtime_watch import running
 
-from ecslam.config import Config, load_config
+from ecslam.config import load_config
 from ecslam.evaluation.trajectory import absolute_error
-from ecslam.messages import Notice, Resume, Snapshot, SpeedLimit, State
+from ecslam.messages import Notice, State
+from ecslam.runtime import engine as module
 from ecslam.runtime.engine import Engine
 from ecslam.runtime.files import read_lines
 from ecslam.runtime.tally import Tally
@@ -28,7 +30,7 @@ SUMMARY_KEYS = """
 
 def engine(out: Path, sequence=None, behaviour: Behaviour | None = None, **options) -> Engine:
     options = {"make": maker(behaviour), "open_sequence": open_fake} | options
-    return Engine(options.pop("config", Config()), sequence or FakeSequence(), out, **options)
+    return Engine(options.pop("config", QUICK), sequence or FakeSequence(), out, **options)
 
 
 def run(out: Path, sequence=None, behaviour: Behaviour | None = None, **options) -> dict:
@@ -36,7 +38,7 @@ def run(out: Path, sequence=None, behaviour: Behaviour | None = None, **options)
 
 
 def test_the_run_folder_is_complete(tmp_path):
-    config = Config(seed=3, preset="lite")
+    config = replace(QUICK, seed=3)
     summary = run(tmp_path / "deep/run", config=config)
     out = tmp_path / "deep/run"
     assert sorted(summary) == sorted(SUMMARY_KEYS.split())
@@ -121,13 +123,11 @@ def test_repeated_and_backward_time_stamps_are_skipped(tmp_path):
     assert (np.diff(written) > 0).all()
 
 
-def test_snapshots_keep_a_row_for_each_frame_and_say_lost(tmp_path):
-    sequence = FakeSequence(12, bad=(4,))
-    with running(tmp_path, sequence, Behaviour(lost=(6, 7)), paused_at=0) as (handle, watch, _):
-        handle.submit(SpeedLimit(20.0))
-        handle.submit(Resume())
-        last = watch.state(State.FINISHED)
-        states = {m.frame: m.state for m in watch.seen if isinstance(m, Snapshot)}
+def test_snapshots_keep_a_row_for_each_frame_and_say_lost(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "SNAPSHOT_PERIOD_S", 0.0)
+    seen = []
+    engine(tmp_path, FakeSequence(12, bad=(4,)), Behaviour(lost=(6, 7))).run(seen.append)
+    last, states = seen[-1], {m.frame: m.state for m in seen[:-1]}
     assert last.trajectory.shape == (12, 4, 4)
     assert np.array_equal(last.trajectory[4], last.trajectory[3])
     assert (last.skipped, last.lost_frames, last.frames_total) == (1, 2, 12)
@@ -135,6 +135,7 @@ def test_snapshots_keep_a_row_for_each_frame_and_say_lost(tmp_path):
     assert states[7] is State.RELOCALISING
     assert states[8] is State.TRACKING
     assert states[10] is State.MAPPING
+    assert last.state is State.FINISHED
     assert [k.frame for k in last.keyframes] == [0, 5, 10]
     assert np.array_equal(last.keyframes[1].c2w, last.trajectory[5])
 
@@ -185,10 +186,12 @@ def test_a_failure_in_the_engine_proper_is_told_and_keeps_the_poses(tmp_path):
 
 def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
     whole = run(tmp_path / "whole", behaviour=Behaviour(lost=(3,)))
-    with running(tmp_path / "cut", FakeSequence(30), Behaviour(lost=(3,)), paused_at=18):
-        pass
-    made = maker()
-    resumed = Engine.resume(tmp_path / "cut", sequence=FakeSequence(30), make=made).run()
+    with running(tmp_path / "cut", FakeSequence(30), Behaviour(lost=(3,), loop_at=11), paused_at=18) as (_, watch, __):
+        (loop,) = watch.state(State.PAUSED).loops
+    made, seen = maker(), []
+    resumed = Engine.resume(tmp_path / "cut", sequence=FakeSequence(30), make=made).run(seen.append)
+    assert np.array_equal(seen[0].loops[0].trajectory_before, loop.trajectory_before)
+    assert seen[0].loops[0].error_after_cm == loop.error_after_cm
     assert made.made[0].trajectory.timestamps[17] == pytest.approx(17 / 30)
     same = ("frames", "keyframes", "lost_frames", "ate_rmse_cm", "seed")
     assert {k: resumed[k] for k in same} == {k: whole[k] for k in same}

@@ -93,22 +93,32 @@ def _generations(folder: Path) -> list[Path]:
 
 
 class CheckpointWriter:
-    """Writes checkpoints in a thread of its own, at most one at a time.
+    """Writes checkpoints in a thread of its own, at most one at a time, ``every`` so many frames.
 
-    ``save`` waits while the one before is still being written: with a checkpoint every n frames, what a kill costs is
-    never more than 2 n frames. ``failed`` is called in the writer's thread with the OSError of a checkpoint that could
-    not be saved.
+    A slow disk does not hold the run up before 2 ``every`` frames hang on the checkpoint being written, which is what a
+    kill costs at most. failed: called in the writer's thread with the OSError of a checkpoint that could not be saved;
+    saved: with none.
     """
 
-    def __init__(self, folder: Path, failed: Callable[[OSError], None], saved: Callable[[], None]) -> None:
-        self._folder, self._failed, self._saved = folder, failed, saved
+    def __init__(
+        self, folder: Path, every: int, failed: Callable[[OSError], None], saved: Callable[[], None], frame: int = 0
+    ) -> None:
+        self._folder, self._every, self._failed, self._saved = folder, every, failed, saved
         self._thread: threading.Thread | None = None
+        self._begun = self._settled = frame
         if folder.is_dir():
             remove_temporaries(folder)
 
+    def due(self, frame: int) -> bool:
+        """Whether the state after ``frame`` frames is to be saved; always after the first one, the most expensive."""
+        busy = self._thread is not None and self._thread.is_alive()
+        late = frame - self._settled >= 2 * self._every
+        return self._begun == 0 or (frame - self._begun >= self._every and (late or not busy))
+
     def save(self, checkpoint: Checkpoint) -> None:
-        """Start writing. The arrays must not be written to afterwards."""
+        """Start writing, after the one before is done. The arrays must not be written to afterwards."""
         self.wait()
+        self._begun = checkpoint.frame
         self._thread = threading.Thread(target=self._write, args=(checkpoint,), name="checkpoint", daemon=True)
         self._thread.start()
 
@@ -124,3 +134,4 @@ class CheckpointWriter:
             self._failed(error)
         else:
             self._saved()
+        self._settled = checkpoint.frame

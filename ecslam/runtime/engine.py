@@ -26,10 +26,12 @@ from .driven import Abandoned, SlamFactory, make_slam
 from .feed import Feed, FeedSubscription
 from .run import Plan, Run
 from .runfolder import RunFolder
+from .snapshots import state_of, take_snapshot
 from .workshop import Workshop
 
 CHECKPOINT_EVERY = 5
 SNAPSHOT_PERIOD_S = 1 / 30
+LONG_STEP_S = 0.5
 
 Items = Iterator[tuple[int, Frame | FrameError]]
 
@@ -184,7 +186,7 @@ class Engine:
         """From the first frame to the summary; what ended it."""
         run, turn = self._run, Turn.STOP
         self._workshop.begin(lambda: self._control.quitting)
-        self._show(run.state())
+        self._show(state_of(run))
         frames = datasets.prefetch(run.plan.sequence, range(run.tally.position, len(run.plan.sequence)))
         try:
             with closing(frames):  # type: ignore[type-var]
@@ -219,6 +221,8 @@ class Engine:
                 raise Abandoned
             if threading.get_ident() == from_here:
                 self._in_between(run)
+                if monotonic() >= self._next_snapshot + LONG_STEP_S:
+                    self._show(State.MAPPING if run.report else State.INITIALISING)
 
         while True:
             run.clock.pause()
@@ -248,7 +252,7 @@ class Engine:
         self._in_between(run)
         self._workshop.keep(run)
         if monotonic() >= self._next_snapshot:
-            self._show(run.state())
+            self._show(state_of(run))
 
     def _failed(self, error: Exception) -> None:
         self.error = self.error or error
@@ -256,7 +260,7 @@ class Engine:
 
     def _show(self, state: State, reason: str = "") -> None:
         self._next_snapshot = monotonic() + SNAPSHOT_PERIOD_S
-        snapshot = self._run.snapshot(state, reason)
+        snapshot = take_snapshot(self._run, state, reason)
         self._feed.publish(snapshot)
         self._progress(snapshot)
 

@@ -14,7 +14,7 @@ from .. import config as configuration
 from ..config import Config
 from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
-from ..messages import Event, KeyframeView, LoopEvent, Notice, Snapshot, State, StepReport
+from ..messages import Event, LoopEvent, Notice, StepReport
 from ..se3 import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint, CheckpointWriter
@@ -24,13 +24,12 @@ from .meshjobs import FrozenMap
 from .pictures import shrink
 from .runfolder import RunFolder
 from .summary import summarise
-from .tally import Stopwatch, Tally, peak_memory_mb
+from .tally import Stopwatch, Tally
 
 ATE_EVERY = 10
 TRAJECTORY_EVERY = 100
 THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
-NO_PICTURE = np.zeros((1, 1, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -66,18 +65,20 @@ class Run:
         self.report: StepReport | None = None
         self.ate_cm: Spread | None = None
         self.loops: list[LoopEvent] = []
-        self._emit, self._make, self._checkpoint_every = emit, make, checkpoint_every
+        self._emit, self._make = emit, make
         self._checkpoints = CheckpointWriter(
             folder.path / "checkpoints",
+            checkpoint_every,
             failed=lambda error: folder.missing("checkpoints", error),
             saved=lambda: folder.found("checkpoints"),
+            frame=self.tally.position,
         )
-        self._thumbnails: dict[int, NDArray[np.uint8]] = {}
-        self._picture: NDArray[np.uint8] | None = None
-        self._lost_for = 0
+        self.thumbnails: dict[int, NDArray[np.uint8]] = {}
+        self.picture: NDArray[np.uint8] | None = None
+        self.lost_for = 0
         if resumed:
             self._build(None, resumed.arrays)
-            self._thumbnails = folder.thumbnails()
+            self.thumbnails, self.loops = folder.thumbnails(), folder.loops()
         else:
             self._describe()
 
@@ -117,10 +118,11 @@ class Run:
             way = "repeats" if item.timestamp == last else "goes back in"
             self._skip(index, f"frame {index} {way} time ({item.timestamp:.6f} s after {last:.6f} s)")
             return None
-        self._picture = shrink(item.color, PICTURE_WIDTH)
+        self.picture = shrink(item.color, PICTURE_WIDTH)
         try:
             report = self._step(item, interrupt)
         except FrameError as error:
+            self.slam = self.slam if self.tally.rows else None
             self._skip(index, str(error))
             return None
         except BaseException:
@@ -177,12 +179,12 @@ class Run:
     def _record(self, report: StepReport, frame: Frame) -> None:
         self.tally.add(report)
         self.report = report
-        self._lost_for = self._lost_for + 1 if report.lost else 0
+        self.lost_for = self.lost_for + 1 if report.lost else 0
         if len(self.tally.rows) % ATE_EVERY == 0:
             self.measure()
         if report.is_keyframe:
-            self._thumbnails[report.frame] = shrink(frame.color, THUMBNAIL_WIDTH)
-            self.folder.keyframe(report.frame, report.c2w, self._thumbnails[report.frame])
+            self.thumbnails[report.frame] = shrink(frame.color, THUMBNAIL_WIDTH)
+            self.folder.keyframe(report.frame, report.c2w, self.thumbnails[report.frame])
         self.folder.metrics(report, self.ate_cm.rmse if self.ate_cm else None)
         if report.loop is not None:
             self.loops.append(report.loop)
@@ -190,7 +192,7 @@ class Run:
             self._emit(report.loop)
         if report.note:
             self.notice("warning" if report.lost else "info", report.note, report.frame)
-        if len(self.tally.rows) == 1 or self.tally.position % self._checkpoint_every == 0:
+        if self._checkpoints.due(self.tally.position):
             self.checkpoint()
         if len(self.tally.rows) % TRAJECTORY_EVERY == 0:
             self.write_trajectory()
@@ -235,49 +237,6 @@ class Run:
         """Frame indices and poses [k, 4, 4] of the keyframes."""
         poses, frames = self.poses(), self.tally.keyframes
         return frames, poses[np.searchsorted(self.tally.rows, frames)]
-
-    def state(self) -> State:
-        """What the engine is doing, from the last frame."""
-        if self.report is None:
-            return State.INITIALISING
-        if self._lost_for:
-            return State.LOST if self._lost_for == 1 else State.RELOCALISING
-        return State.MAPPING if self.report.window else State.TRACKING
-
-    def snapshot(self, state: State, reason: str = "") -> Snapshot:
-        """Everything visible."""
-        sequence, camera, report = self.plan.sequence, self.plan.sequence.intrinsics, self.report
-        poses = self.poses()
-        rows = self.tally.row_of_each_frame() if len(poses) else np.zeros(0, np.int64)
-        frames, keyframe_poses = self.keyframe_poses()
-        seconds = self.clock.seconds
-        return Snapshot(
-            state=state,
-            sequence=sequence.name,
-            preset=self.config.preset,
-            frame=max(self.tally.position - 1, 0),
-            frames_total=len(sequence),
-            trajectory=poses[rows],
-            trajectory_gt=self.truth,
-            keyframes=tuple(
-                map(KeyframeView, frames, keyframe_poses, (self._thumbnails.get(f, NO_PICTURE) for f in frames))
-            ),
-            window=report.window if report else (),
-            color=self._picture,
-            fov_y_rad=2 * float(np.arctan(camera.height / (2 * camera.fy))),
-            aspect=camera.width / camera.height,
-            losses=report.losses if report else {},
-            track_ms=report.track_ms if report else 0.0,
-            map_ms=report.map_ms if report else 0.0,
-            fps_wall=len(self.tally.rows) / seconds if seconds else 0.0,
-            fps_engine=self.tally.fps_engine,
-            ate_cm=self.ate_cm.rmse if self.ate_cm else None,
-            memory_mb=peak_memory_mb(),
-            loops=tuple(self.loops),
-            skipped=self.tally.skipped,
-            lost_frames=self.tally.lost,
-            reason=reason,
-        )
 
     # ---- saving -----------------------------------------------------------------------------------------------------
 

@@ -142,6 +142,15 @@ class RunFolder:
             found[int(line["frame"])] = black if image is None else np.asarray(image[..., ::-1], np.uint8)
         return found
 
+    def loops(self) -> list[LoopEvent]:
+        """The loop closures in the log."""
+        lines = [line for line in read_lines(self.path / "events.jsonl") if line.pop("type", "") == "loop"]
+        for line in lines:
+            line["keyframes"] = tuple(line["keyframes"])
+            line["trajectory_before"] = np.array(line["trajectory_before"], np.float32).reshape(-1, 3)
+            line["c2w_before"] = None if line["c2w_before"] is None else np.array(line["c2w_before"])
+        return [LoopEvent(**line) for line in lines]
+
     def _append(self, name: str, line: dict[str, Any]) -> None:
         try:
             if name in self._logs:
