@@ -27,9 +27,10 @@ from urllib.parse import parse_qs, urlsplit
 import viser
 import websockets.asyncio.server
 import websockets.exceptions
-from ecslam.types import InputError
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
+
+from ecslam.types import InputError
 
 from .guard import make_check
 from .page import index_page
@@ -89,13 +90,17 @@ def is_loopback(host: str) -> bool:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening socket (``port`` 0: any free one). Raises InputError when the port is busy or the host is not ours."""
+    """A listening socket (``port`` 0: any free one). Raises InputError when the port is busy or the host not ours."""
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: a port lies in 0 .. 65535; 0 takes any free one")
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
+            0
+        ]
     except OSError:
-        raise InputError(f"--host {host}: no such host; 127.0.0.1 serves this machine, 0.0.0.0 all its networks") from None
+        raise InputError(
+            f"--host {host}: no such host; 127.0.0.1 serves this machine, 0.0.0.0 all its networks"
+        ) from None
     listener = socket.socket(family, kind)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -123,6 +128,12 @@ def open_viser(listener: socket.socket, host: str, token: str | None, label: str
     for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
         server._websock_server.unregister_handler(message)
     return server
+
+
+def close_viser(server: viser.ViserServer) -> None:
+    """Stop a server without viser's own words about it on the terminal."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
 
 
 @contextlib.contextmanager
@@ -201,7 +212,11 @@ class _Guarded:
 
 def _plain(status: int, text: str, headers: dict[str, str] | None = None) -> Response:
     body = f"{text}\n".encode() if text else b""
-    fields = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Cache-Control": "no-store"}
+    fields = {
+        "Content-Type": "text/plain; charset=utf-8",
+        "Content-Length": str(len(body)),
+        "Cache-Control": "no-store",
+    }
     phrase = http.HTTPStatus(status).phrase
     return Response(status, phrase, Headers({**fields, "Connection": "close", **(headers or {})}), body)
 

@@ -18,7 +18,7 @@ def rotation_difference_deg(a: Array, b: Array) -> Array:
     """Angle in degrees between the rotations of poses [n, 4, 4]; NaN where either is NaN."""
     r = np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]
     vee = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], 1)
-    return np.degrees(np.arctan2(np.linalg.norm(vee, axis=1), np.trace(r, axis1=1, axis2=2) - 1))
+    return np.asarray(np.degrees(np.arctan2(np.linalg.norm(vee, axis=1), np.trace(r, axis1=1, axis2=2) - 1)))
 
 
 def polyline(points: Array, most: int = 2000) -> NDArray[np.float32]:
@@ -43,7 +43,7 @@ def frustum_lines(c2w: Array, fov_y: float, aspect: float, scale: float) -> NDAr
     """Edges [n * 8, 2, 3] of the frusta of poses [n, 4, 4]."""
     corners = frustum_corners(fov_y, aspect, scale)
     world = np.einsum("nij,kj->nki", c2w[:, :3, :3], corners) + c2w[:, None, :3, 3]
-    return world[:, FRUSTUM_EDGES].reshape(-1, 2, 3).astype(np.float32)
+    return np.asarray(world[:, FRUSTUM_EDGES].reshape(-1, 2, 3), np.float32)
 
 
 def up_direction(c2w: Array) -> Array:
@@ -74,7 +74,16 @@ def overview(low: Array, high: Array, up: Array, aspect: float, fov_y: float) ->
     away = 0.52 * side + 0.33 * np.cross(up, side) + 0.79 * up
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.5)
     half = np.arctan(np.tan(fov_y / 2) * min(1.0, aspect))
-    return centre + away / np.linalg.norm(away) * radius / np.sin(half) * 0.82, centre
+    away *= radius / np.sin(half) * 0.82 / np.linalg.norm(away)
+    if aspect < 0.8:  # a phone, whose lower half is covered by the controls
+        centre = centre - 0.45 * np.linalg.norm(away) * np.tan(fov_y / 2) * _screen_up(up, away)
+    return centre + away, centre
+
+
+def _screen_up(up: Array, away: Array) -> Array:
+    back = away / np.linalg.norm(away)
+    upward = up - (up @ back) * back
+    return np.asarray(upward / np.linalg.norm(upward))
 
 
 def behind(c2w: Array, up: Array, distance: float = 1.1) -> tuple[Array, Array]:

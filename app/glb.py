@@ -6,8 +6,9 @@ import json
 import struct
 
 import numpy as np
-from ecslam.types import Mesh
 from numpy.typing import NDArray
+
+from ecslam.types import Mesh
 
 TRIANGLE_BUDGET = 100_000
 
@@ -26,7 +27,7 @@ def vertex_normals(mesh: Mesh) -> NDArray[np.float32]:
     for corner in range(3):
         for axis in range(3):
             out[:, axis] += np.bincount(mesh.faces[:, corner], face[:, axis], len(out))
-    return (out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12), np.float32)
 
 
 def simplify(mesh: Mesh, triangles: int = TRIANGLE_BUDGET) -> Mesh:

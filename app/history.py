@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from ecslam.messages import Snapshot
 from numpy.typing import NDArray
+
+from ecslam.messages import Snapshot
 
 from .geometry import rotation_difference_deg
 
@@ -57,6 +58,10 @@ def discrepancy(s: Snapshot, most: int = 400) -> tuple[str, NDArray[np.float64],
     if s.trajectory_gt is not None and len(s.trajectory):
         count = min(len(s.trajectory), len(s.trajectory_gt))
         pick = np.linspace(0, count - 1, min(count, most)).round().astype(int)
-        return "Rotation error (°)", pick.astype(float), rotation_difference_deg(s.trajectory[pick], s.trajectory_gt[pick])
+        return (
+            "Rotation error (°)",
+            pick.astype(float),
+            rotation_difference_deg(s.trajectory[pick], s.trajectory_gt[pick]),
+        )
     frames = np.array([0, *(e.frame for e in s.loops), max(s.frame, 1)], float)
     return "Correction (cm)", frames, np.array([0.0, *(e.correction_cm for e in s.loops), 0.0])

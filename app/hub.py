@@ -16,7 +16,20 @@ from pathlib import Path
 from typing import Any
 
 import viser
-from ecslam.messages import Ack, Command, Event, Export, Exported, LoopEvent, MeshReady, Notice, RequestMesh, Snapshot, State
+
+from ecslam.messages import (
+    Ack,
+    Command,
+    Event,
+    Export,
+    Exported,
+    LoopEvent,
+    MeshReady,
+    Notice,
+    RequestMesh,
+    Snapshot,
+    State,
+)
 from ecslam.runtime.protocol import EngineHandle
 
 from . import theme
@@ -28,8 +41,9 @@ from .scene import Scene
 
 log = logging.getLogger(__name__)
 
-REFRESH_S = 0.12
-MESH_EVERY_S = 1.5
+# viser packs every message once per viewer, so more viewers get fewer updates and the engine keeps its pace.
+REFRESH_S, REFRESH_PER_VIEWER_S = 0.12, 0.02
+MESH_EVERY_S, MESH_PER_VIEWER_S = 1.5, 0.25
 DOWNLOAD_LIMIT = 256 * 1024 * 1024
 
 
@@ -116,18 +130,19 @@ class Hub:
     def commands(self, button: Any, make: Callable[[], Command]) -> None:
         """Let a button submit what ``make`` builds, on the event loop, without waiting for anything."""
 
-        @button.on_click
-        async def _(event: Any) -> None:
+        async def clicked(event: Any) -> None:
             self.submit(make(), event.client)
+
+        button.on_click(clicked)
 
     def on(self, handle: Any, action: Callable[[Any], Any]) -> None:
         """Run ``action(event)`` on the hub's thread when a browser changes or clicks a control."""
-        register = handle.on_click if hasattr(handle, "on_click") else handle.on_update
 
-        @register
-        async def _(event: Any) -> None:
+        async def changed(event: Any) -> None:
             if event.client is not None:
                 self.post(partial(action, event))
+
+        (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(changed)
 
     def viewers(self) -> Iterable[viser.ClientHandle]:
         """The connected browsers."""
@@ -142,7 +157,7 @@ class Hub:
         """Say where a file lies and start its download in the browser of who asked for it."""
         size = path.stat().st_size
         text = f"{path}  ({size / 1e6:.1f} MB)"
-        if client is None:
+        if client is None or client.client_id not in self.server.get_clients():
             return
         if size > DOWNLOAD_LIMIT:
             self.toast("Saved", f"{text}; too large to download here", "yellow", client)
@@ -185,7 +200,8 @@ class Hub:
             if action is None:
                 return
             if action == self._wake:
-                show_at = show_at or max(time.monotonic(), shown + REFRESH_S)
+                pause = REFRESH_S + REFRESH_PER_VIEWER_S * len(self.server.get_clients())
+                show_at = show_at or max(time.monotonic(), shown + pause)
             else:
                 self._attempt(action)
 
@@ -225,7 +241,7 @@ class Hub:
             self.scene.show_all(client, 0.0)
 
     def _want_mesh(self, s: Snapshot) -> None:
-        now, period = time.monotonic(), MESH_EVERY_S + 0.1 * len(self.server.get_clients())
+        now, period = time.monotonic(), MESH_EVERY_S + MESH_PER_VIEWER_S * len(self.server.get_clients())
         due = now - self._mesh_asked > (period if not self._mesh_pending else 20.0)
         if self.mesh_wanted and due and s.frame != self._mesh_frame and s.state not in (State.IDLE, State.FAILED):
             self._mesh_asked, self._mesh_pending, self._mesh_frame = now, True, s.frame
@@ -248,7 +264,7 @@ class Hub:
             color = {"info": "blue", "warning": "yellow"}.get(message.level, "red")
             self.toast(message.level.capitalize(), message.text, color)
         elif isinstance(message, LoopEvent):
-            self.toast("Loop closed", f"Frame {message.frame}: corrected by {message.correction_cm:.1f} cm", "teal")
+            self.toast("Loop closed", f"Frame {message.frame + 1}: corrected by {message.correction_cm:.1f} cm", "teal")
         for panel in self.panels:
             panel.event(message)
 

@@ -21,7 +21,8 @@ _ICON = (
 _POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob: data:; "
-    "connect-src 'self' ws://{host} wss://{host} blob: data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    "connect-src 'self' ws://{host} wss://{host} blob: data:; frame-ancestors 'none'; base-uri 'none'; "
+    "form-action 'none'"
 )
 
 

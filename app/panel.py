@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ecslam.messages import Ack, Event, KeyframeView, Snapshot
 
@@ -45,6 +45,11 @@ class BasePanel:
 
     def keyframe(self, keyframe: KeyframeView) -> None:
         """A viewer has clicked a keyframe's frustum."""
+
+
+def put(control: Any, value: Any) -> None:
+    """Set the value of a control on the page. (viser's setter is invisible to type checkers.)"""
+    control.value = value
 
 
 def find_panels() -> list[type[BasePanel]]:

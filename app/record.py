@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+
 from ecslam.messages import MeshReady, Snapshot
 from ecslam.types import Mesh
 
-from .front import bind, open_viser
+from .front import bind, close_viser, open_viser
 from .geometry import overview
 from .history import History
 from .scene import Scene
@@ -34,7 +35,7 @@ def html_replay(s: Snapshot, mesh: Mesh | None, history: History, dark: bool) ->
             serializer.insert_sleep(SECONDS / STEPS)
         return str(serializer.as_html(dark_mode=dark))
     finally:
-        server.stop()
+        close_viser(server)
 
 
 def _until(s: Snapshot, count: int, history: History) -> Snapshot:

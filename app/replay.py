@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+
 from ecslam.messages import (
     Ack,
     Command,
@@ -181,7 +182,9 @@ def export(run: Run, command: Export) -> Path:
         return path
     if command.kind == "trajectory":
         path = folder / f"trajectory_{command.format or 'tum'}.txt"
-        path.write_text(kitti_lines(run.trajectory) if command.format == "kitti" else tum_lines(run.timestamps, run.trajectory))
+        path.write_text(
+            kitti_lines(run.trajectory) if command.format == "kitti" else tum_lines(run.timestamps, run.trajectory)
+        )
         return path
     if command.kind == "keyframes":
         path = folder / "keyframes.txt"

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 import trimesh
 import viser.transforms as vt
+from numpy.typing import NDArray
+
 from ecslam.messages import KeyframeView, LoopEvent
 from ecslam.types import InputError, Mesh
-from numpy.typing import NDArray
 
 from .geometry import wxyz
 
@@ -25,7 +26,7 @@ _NO_PICTURE = np.zeros((3, 4, 3), np.uint8)
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run. rows: one dictionary a frame, as in ``metrics.jsonl``. meshes: path by the frame it was made at."""
+    """A finished run. rows: one dictionary a frame, as in ``metrics.jsonl``. meshes: path by frame."""
 
     folder: Path
     summary: dict[str, Any]
@@ -84,10 +85,11 @@ def load_run(folder: Path) -> Run:
 def load_mesh(path: Path) -> Mesh:
     """A mesh file as our type. Raises InputError when it cannot be read."""
     try:
-        loaded = trimesh.load_mesh(path, process=False)
-    except (OSError, ValueError) as error:
+        loaded: Any = trimesh.load_mesh(path, process=False)
+    except (OSError, ValueError, LookupError) as error:
         raise InputError(f"{path}: not a readable mesh ({error}); make it again with `ecslam mesh`") from None
-    colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(np.uint8) if loaded.visual.kind == "vertex" else None
+    coloured = loaded.visual is not None and loaded.visual.kind == "vertex"
+    colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(np.uint8) if coloured else None
     return Mesh(np.asarray(loaded.vertices, np.float32), np.asarray(loaded.faces, np.int32), colors)
 
 
@@ -166,7 +168,7 @@ def _picture(folder: Path, name: Any) -> NDArray[np.uint8]:
 
 
 def _loop_event(row: dict[str, Any]) -> LoopEvent:
-    values = {f.name: row.get(f.name) for f in fields(LoopEvent)}
+    values: dict[str, Any] = {f.name: row.get(f.name) for f in fields(LoopEvent)}
     values["keyframes"] = tuple(int(k) for k in values["keyframes"] or ())
     before = np.asarray(values["trajectory_before"] or np.zeros((0, 3)), np.float32).reshape(-1, 3)
     return LoopEvent(**{**values, "trajectory_before": before})

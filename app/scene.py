@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
+
 from ecslam.messages import KeyframeView, LoopEvent, MeshReady, Snapshot
 from ecslam.types import Mesh
-from numpy.typing import NDArray
 
 from . import theme
 from .geometry import (
@@ -262,7 +263,11 @@ class Scene:
         self.fly(client, *behind(keyframe.c2w, self.up, 0.45))
 
     def fly(
-        self, client: viser.ClientHandle, position: NDArray[np.float64], look_at: NDArray[np.float64], seconds: float = 0.6
+        self,
+        client: viser.ClientHandle,
+        position: NDArray[np.float64],
+        look_at: NDArray[np.float64],
+        seconds: float = 0.6,
     ) -> None:
         """Move one viewer smoothly."""
         start = np.array(client.camera.position), np.array(client.camera.look_at)
@@ -270,6 +275,8 @@ class Scene:
         async def glide() -> None:
             steps = max(1, int(30 * seconds))
             for step in range(1, steps + 1):
+                if client.client_id not in self._server.get_clients():
+                    return
                 t = step / steps
                 ease = t * t * (3 - 2 * t)
                 _place(client, start[0] + ease * (position - start[0]), start[1] + ease * (look_at - start[1]))

@@ -1,4 +1,4 @@
-"""The dashboard as one call: ``start`` puts an engine (live or a replay) on a web page, ``view`` opens finished runs."""
+"""The dashboard as one call: ``start`` puts an engine (live or a replay) on a page, ``view`` opens finished runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from ecslam.runtime.protocol import EngineHandle
 from ecslam.types import InputError
 
-from .front import bind, is_loopback, open_viser
+from .front import bind, close_viser, is_loopback, open_viser
 from .hub import Hub
 from .replay import ReplayEngine
 from .runs import load_run
@@ -36,7 +36,7 @@ class Dashboard:
     def close(self) -> None:
         """Close the page; a live engine goes on, a replay ends."""
         self.hub.close()
-        self.hub.server.stop()
+        close_viser(self.hub.server)
         if isinstance(self.engine, ReplayEngine):
             self.engine.close()
 
@@ -53,7 +53,9 @@ def start(
     port 0 takes any free port. A host that other machines can reach always needs a token: without one given a fresh
     one is made. The token is part of ``Dashboard.url``; the page then keeps it in a cookie.
     """
-    if token is not None and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.replace("-", "_").isidentifier()):
+    if token is not None and (
+        len(token) < SHORTEST_TOKEN or not token.isascii() or not token.replace("-", "_").isidentifier()
+    ):
         raise InputError(f"--token: use at least {SHORTEST_TOKEN} letters, digits, '-' or '_', beginning with a letter")
     if token is None and not is_loopback(host):
         token = f"t{secrets.token_urlsafe(24)}"
@@ -76,5 +78,7 @@ def view(
     loaded = [load_run(folder) for folder in runs]
     names = {str(run.summary.get("sequence", "")) for run in loaded}
     if len(names) > 1:
-        raise InputError(f"{runs[0]} and {runs[1]}: runs on different sequences ({', '.join(sorted(names))}) cannot be compared")
+        raise InputError(
+            f"{runs[0]} and {runs[1]}: runs on different sequences ({', '.join(sorted(names))}) cannot be compared"
+        )
     return start(ReplayEngine(loaded[0], tuple(loaded[1:])), host, port, token, dark)

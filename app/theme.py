@@ -39,10 +39,13 @@ STYLE = """
 .mantine-Button-root{border-radius:7px;font-weight:600}
 .mantine-Button-root[style*="gray-filled"]{--button-bg:transparent!important;--button-hover:rgba(128,128,128,.12)!important;
   --button-color:var(--mantine-color-text)!important;border:1px solid var(--mantine-color-default-border)}
+@media (max-width:48em){.mantine-Paper-root[style*="bottom: 0px"]{width:100%!important;max-height:52%!important;
+  border-radius:14px 14px 0 0!important}.mantine-Paper-root [style*="width: 20em"]{width:100%!important}}
 .u-legend .u-series:first-child,.u-legend .u-value{display:none!important}
 .u-legend .u-label:after{display:none!important}
 .u-title{font-size:12.5px!important;font-weight:600}
-.ec{font-size:12.5px;line-height:1.45;color:var(--mantine-color-text);padding:4px 8px 6px;font-variant-numeric:tabular-nums}
+.ec{font-size:12.5px;line-height:1.45;color:var(--mantine-color-text);padding:4px 8px 6px;
+  font-variant-numeric:tabular-nums}
 .ec b{font-weight:600}
 .ec .dim{color:var(--mantine-color-dimmed)}
 .ec-head{display:flex;align-items:center;gap:8px;margin-bottom:7px;min-width:0}
@@ -61,15 +64,18 @@ STYLE = """
 .ec-note{margin:7px 0 0;padding:6px 9px;border-radius:8px;border-left:3px solid var(--c);
   background:color-mix(in srgb,var(--c) 10%,transparent)}
 .ec table{width:100%;border-collapse:collapse}
-.ec td,.ec th{padding:3px 4px;text-align:right;border-bottom:1px solid var(--mantine-color-default-border);font-weight:400}
+.ec td,.ec th{padding:3px 4px;text-align:right;font-weight:400;
+  border-bottom:1px solid var(--mantine-color-default-border)}
 .ec td:first-child,.ec th:first-child{text-align:left;color:var(--mantine-color-dimmed)}
 .ec th{font-weight:600}
 .ec-key{display:flex;flex-wrap:wrap;gap:3px 12px;font-size:11.5px;color:var(--mantine-color-dimmed)}
-.ec-key i{display:inline-block;width:14px;height:3px;border-radius:2px;margin-right:5px;vertical-align:middle;background:var(--c)}
+.ec-key i{display:inline-block;width:14px;height:3px;border-radius:2px;margin-right:5px;background:var(--c);
+  vertical-align:middle}
 .ec-six{display:grid;grid-template-columns:1fr 1fr;gap:5px}
 .ec-six figure{margin:0;position:relative;border-radius:6px;overflow:hidden;background:#8884;aspect-ratio:4/3}
 .ec-six img{width:100%;height:100%;object-fit:cover;display:block}
-.ec-six figcaption{position:absolute;left:5px;bottom:4px;font-size:10px;padding:0 6px;border-radius:9px;color:#fff;background:#0009}
+.ec-six figcaption{position:absolute;left:5px;bottom:4px;font-size:10px;padding:0 6px;border-radius:9px;color:#fff;
+  background:#0009}
 """
 
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+
 from ecslam import messages as m
 from ecslam.runtime.feed import Feed
 from ecslam.types import InputError, Mesh
@@ -64,7 +65,9 @@ def _box(low, high, step, inward, paint=None):
         stripe = 0.93 + 0.07 * np.sign(np.sin(points @ [5.0, 7.0, 11.0] * (2.2 if side == 4 else 0.7)))
         shade = (1.06, 0.9, 0.98, 0.86, 0.8, 1.08)[side]
         colors.append(np.clip(color * stripe[:, None] * shade, 0, 255))
-    return Mesh(np.concatenate(vertices).astype(np.float32), np.concatenate(faces), np.concatenate(colors).astype(np.uint8))
+    return Mesh(
+        np.concatenate(vertices).astype(np.float32), np.concatenate(faces), np.concatenate(colors).astype(np.uint8)
+    )
 
 
 def walk(count: int) -> np.ndarray:
@@ -112,7 +115,8 @@ class FakeEngine:
 
     def stop(self):
         self._alive = False
-        self._thread.join(5)
+        if self._thread.is_alive():
+            self._thread.join(5)
 
     def submit(self, command):
         with self._lock:
@@ -185,7 +189,8 @@ class FakeEngine:
         return m.Snapshot(
             self._state, self._sequence, self._preset, i, self.frames, poses, self._gt if self.truth else None, keys,
             window, picture(i), FOV, ASPECT,
-            {"free_space": 0.1 + decay, "centre": 0.05 + 0.5 * decay, "depth": 0.2 * decay + 0.02, "colour": 0.3 * decay + 0.1},
+            {"free_space": 0.1 + decay, "centre": 0.05 + 0.5 * decay, "depth": 0.2 * decay + 0.02,
+             "colour": 0.3 * decay + 0.1},
             21.0 + 3 * np.sin(i), 84.0 + 9 * np.cos(i), 11.2, 14.9,
             float(np.sqrt((error**2).mean())) if self.truth else None, 512.0 + i, self._loops, 0, 0,
         )  # fmt: skip
@@ -249,7 +254,7 @@ class FakeEngine:
                 self._mesh.vertices, self._mesh.faces, vertex_colors=self._mesh.colors, process=False
             ).export(path)
         elif kind == "trajectory":
-            rows = self.latest().trajectory[:, :3, 3]
+            rows = self.snapshot().trajectory[:, :3, 3]
             path.write_text("".join(f"{i} {x} {y} {z} 0 0 0 1\n" for i, (x, y, z) in enumerate(rows)))
         else:
             path.write_text(f"{kind}\n")

@@ -65,7 +65,8 @@ def figures_table(a: Run, b: Run) -> str:
         for key, label, digits in _FIGURES
         if a.summary.get(key) is not None or b.summary.get(key) is not None
     )
-    return f'<div class="ec"><table><tr><th></th><th>{escape(a.name)}</th><th>{escape(b.name)}</th></tr>{rows}</table></div>'
+    names = f"<th></th><th>{escape(a.name)}</th><th>{escape(b.name)}</th>"
+    return f'<div class="ec"><table><tr>{names}</tr>{rows}</table></div>'
 
 
 def _text(run: Run, key: str, digits: int | None) -> str:

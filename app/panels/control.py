@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from ecslam.config import load_preset
@@ -22,7 +23,7 @@ from ecslam.messages import (
 from ecslam.types import InputError
 
 from ..hub import Hub
-from ..panel import BasePanel
+from ..panel import BasePanel, put
 
 SCHEDULES = ("strict", "overlap")
 _VERBS: dict[str, Command] = {"Pause": Pause(), "Resume": Resume(), "Step": Step(), "Stop": Stop()}
@@ -39,10 +40,13 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
+        self._shown_sequence, self._shown_preset = "", ""
         gui = hub.server.gui
         verbs = gui.add_button_group("Run", tuple(_VERBS))
         hub.commands(verbs, lambda: _VERBS[verbs.value])
-        self._until = gui.add_number("Frame", 1, min=1, max=1_000_000, step=1, hint="Go on until this frame, then pause")
+        self._until = gui.add_number(
+            "Frame", 1, min=1, max=1_000_000, step=1, hint="Go on until this frame, then pause"
+        )
         hub.commands(gui.add_button("Run to frame", color="gray"), lambda: RunTo(int(self._until.value) - 1))
         self._limit = gui.add_slider("Speed limit", 0, 60, 1, 0, hint="Frames per second at most; 0 lifts the limit")
         hub.on(self._limit, lambda event: hub.submit(SpeedLimit(float(self._limit.value)), event.client))
@@ -53,11 +57,11 @@ class Panel(BasePanel):
     def snapshot(self, s: Snapshot) -> None:
         if int(self._until.max or 0) != s.frames_total:
             self._until.max = s.frames_total
-            self._until.value = max(1, s.frames_total // 2)
+            put(self._until, max(1, s.frames_total // 2))
         if s.preset != self._shown_preset:
             self._show_preset(s.preset)
         if self._sequence.value != s.sequence and not self._shown_sequence and s.sequence in self._sequence.options:
-            self._sequence.value = s.sequence
+            put(self._sequence, s.sequence)
         self._shown_sequence = s.sequence
 
     def _hot_keys(self) -> None:
@@ -77,7 +81,6 @@ class Panel(BasePanel):
     def _start_over(self) -> None:
         gui, engine = self.hub.server.gui, self.hub.engine
         current = engine.latest()
-        self._shown_sequence, self._shown_preset = "", ""
         sequences = engine.sequences or ("synthetic/studio",)
         presets = engine.presets or ("lite",)
         with gui.add_folder("Start over"):
@@ -88,10 +91,14 @@ class Panel(BasePanel):
                 "Preset", presets, initial_value=_choose(current.preset if current else "lite", presets)
             )
             self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
-            self._schedule = gui.add_dropdown("Schedule", SCHEDULES, hint="strict: repeatable; overlap: mapping in parallel")
+            self._schedule = gui.add_dropdown(
+                "Schedule", SCHEDULES, hint="strict: repeatable; overlap: mapping in parallel"
+            )
             self.hub.commands(gui.add_button("Restart", color="orange"), self._restart)
             self.hub.commands(
-                gui.add_button("Go on with this preset", color="gray", hint="Its tracking and mapping settings from here"),
+                gui.add_button(
+                    "Go on with this preset", color="gray", hint="Its tracking and mapping settings from here"
+                ),
                 lambda: LoadPreset(self._preset.value),
             )
 
@@ -109,18 +116,21 @@ class Panel(BasePanel):
                 )
             }
         for key, slider in self._iterations.items():
-            self.hub.on(slider, lambda event, key=key: self.hub.submit(Tune(key, int(event.target.value)), event.client))
+            self.hub.on(slider, partial(self._tune, key))
+
+    def _tune(self, key: str, event: Any) -> None:
+        self.hub.submit(Tune(key, int(event.target.value)), event.client)
 
     def _show_preset(self, name: str) -> None:
         self._shown_preset = name
         if name in self._preset.options:
-            self._preset.value = name
+            put(self._preset, name)
         try:
             config = load_preset(name)
         except InputError:
             return
         for key, slider in self._iterations.items():
-            slider.value = min(getattr(config, key.split(".")[0]).iterations, int(slider.max))
+            put(slider, min(getattr(config, key.split(".")[0]).iterations, int(slider.max)))
 
 
 def _choose(wanted: str, options: tuple[str, ...]) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import viser
+
 from ecslam.messages import Export
 
 from ..hub import Hub
@@ -34,13 +35,23 @@ class Panel(BasePanel):
         with gui.add_folder("Poses"):
             poses = gui.add_dropdown("Format", ("TUM", "KITTI"))
             hub.commands(
-                gui.add_button("Export trajectory", icon=viser.Icon.DOWNLOAD), lambda: Export("trajectory", poses.value.lower())
+                gui.add_button("Export trajectory", icon=viser.Icon.DOWNLOAD),
+                lambda: Export("trajectory", poses.value.lower()),
             )
-            hub.commands(gui.add_button("Export keyframes", icon=viser.Icon.DOWNLOAD, color="gray"), lambda: Export("keyframes"))
+            hub.commands(
+                gui.add_button("Export keyframes", icon=viser.Icon.DOWNLOAD, color="gray"), lambda: Export("keyframes")
+            )
         with gui.add_folder("Everything else"):
-            hub.commands(gui.add_button("Export run as zip", icon=viser.Icon.FILE_ZIP, color="gray"), lambda: Export("run", "zip"))
-            hub.commands(gui.add_button("Export configuration", icon=viser.Icon.SETTINGS, color="gray"), lambda: Export("config"))
-            hub.on(gui.add_button("Save screenshot", icon=viser.Icon.CAMERA, color="gray"), self._later(self._screenshot))
+            hub.commands(
+                gui.add_button("Export run as zip", icon=viser.Icon.FILE_ZIP, color="gray"),
+                lambda: Export("run", "zip"),
+            )
+            hub.commands(
+                gui.add_button("Export configuration", icon=viser.Icon.SETTINGS, color="gray"), lambda: Export("config")
+            )
+            hub.on(
+                gui.add_button("Save screenshot", icon=viser.Icon.CAMERA, color="gray"), self._later(self._screenshot)
+            )
             hub.on(gui.add_button("Save HTML replay", icon=viser.Icon.MOVIE, color="gray"), self._later(self._replay))
 
     def _later(self, job: Any) -> Any:

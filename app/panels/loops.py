@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
 from ecslam.messages import LoopEvent, PauseOnLoop, Snapshot
 
 from .. import theme
 from ..history import discrepancy
 from ..hub import Hub
-from ..panel import BasePanel
+from ..panel import BasePanel, put
 from .plots import Chart
 
 NONE = "None"
@@ -32,7 +33,9 @@ class Panel(BasePanel):
         hub.on(steps, lambda event: self._move(-1 if steps.value.startswith("Prev") else 1, event.client))
         self._html = gui.add_html(_intro())
         gui.add_html(
-            theme.legend([("links", theme.LOOP), ("before", theme.BEFORE), ("after", theme.ESTIMATE), ("window", theme.WINDOW)])
+            theme.legend(
+                [("links", theme.LOOP), ("before", theme.BEFORE), ("after", theme.ESTIMATE), ("window", theme.WINDOW)]
+            )
         )
         if hub.replay is None:
             pause = gui.add_checkbox("Pause on loop closure", False)
@@ -53,7 +56,7 @@ class Panel(BasePanel):
         if self._events:
             options = list(self._choice.options)
             at = options.index(self._choice.value) + step
-            self._choice.value = options[(at - 1) % (len(options) - 1) + 1]
+            put(self._choice, options[(at - 1) % (len(options) - 1) + 1])
             self._inspect(client)
 
     def _inspect(self, client: Any) -> None:

@@ -1,4 +1,4 @@
-"""Six pictures of the current frame or of a chosen keyframe: colour and depth as input, rendered, and their difference."""
+"""Six pictures of the current frame or of a keyframe: colour and depth as input, rendered, and their difference."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import time
 
 import cv2
 import numpy as np
-from ecslam.messages import Event, FramePictures, KeyframeView, RequestPictures, Snapshot, State
 from numpy.typing import NDArray
+
+from ecslam.messages import Event, FramePictures, KeyframeView, RequestPictures, Snapshot, State
 
 from ..hub import Hub
 from ..panel import BasePanel
@@ -56,7 +57,9 @@ class Panel(BasePanel):
     def keyframe(self, keyframe: KeyframeView) -> None:
         self._keyframe = True
         figure = _figure(keyframe.thumbnail, "colour")
-        self._html.content = f'<div class="ec"><b>Keyframe {keyframe.frame + 1}</b><div class="ec-six">{figure}</div></div>'
+        self._html.content = (
+            f'<div class="ec"><b>Keyframe {keyframe.frame + 1}</b><div class="ec-six">{figure}</div></div>'
+        )
         if self.hub.replay is None:
             self.hub.submit(RequestPictures(keyframe.frame))
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from ecslam.messages import Snapshot, State
 from numpy.typing import NDArray
 from viser import uplot
+
+from ecslam.messages import Snapshot, State
 
 from .. import theme
 from ..hub import Hub

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ecslam.messages import Command, Pause, Resume, RunTo, Snapshot, SpeedLimit, Step
 
 from ..hub import Hub
-from ..panel import BasePanel
+from ..panel import BasePanel, put
 
 _VERBS: dict[str, Command] = {"Play": Resume(), "Pause": Pause(), "Step": Step()}
 
@@ -31,4 +31,4 @@ class Panel(BasePanel):
 
     def snapshot(self, s: Snapshot) -> None:
         if s.state.value == "tracking":
-            self._slider.value = s.frame + 1
+            put(self._slider, s.frame + 1)

@@ -40,7 +40,11 @@ class Panel(BasePanel):
 
     def ack(self, ack: Ack) -> None:
         self._coming = _COMING.get(type(ack.command), "")
-        settled = self.hub.current is not None and self.hub.current.state in (State.PAUSED, State.FINISHED, State.FAILED)
+        settled = self.hub.current is not None and self.hub.current.state in (
+            State.PAUSED,
+            State.FINISHED,
+            State.FAILED,
+        )
         if self._coming and not ack.error and not (settled and isinstance(ack.command, (Pause, Stop))):
             self._html.content = render(self.hub.current, self._coming)
 
@@ -48,7 +52,8 @@ class Panel(BasePanel):
 def render(s: Snapshot | None, coming: str) -> str:
     """The status card as HTML; ``coming`` replaces the state while a command is being carried out."""
     if s is None:
-        return f'<div class="ec"><div class="ec-head">{theme.chip("Waiting for the first frame", theme.KEYFRAME)}</div></div>'
+        waiting = theme.chip("Waiting for the first frame", theme.KEYFRAME)
+        return f'<div class="ec"><div class="ec-head">{waiting}</div></div>'
     color = theme.STATE_COLORS[s.state.value]
     done = 100 * (s.frame + 1) / max(s.frames_total, 1)
     cells = [

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 import viser
 
 from .. import theme
@@ -25,10 +28,13 @@ class Panel(BasePanel):
             hub.on(detail, lambda event: self._set_detail(detail.value))
         for label, group in (("Ground truth", "trajectory/ground truth"), ("Keyframes", "keyframes")):
             layer = gui.add_checkbox(label, True)
-            hub.on(layer, lambda event, group=group: hub.scene.set_visible(group, bool(event.target.value)))
+            hub.on(layer, partial(self._set_layer, group))
         follow = gui.add_checkbox("Follow camera", False)
         hub.on(follow, lambda event: self._set_follow(bool(follow.value)))
-        hub.on(gui.add_button("Reset view", icon=viser.Icon.FOCUS_CENTERED, color="gray"), lambda event: hub.scene.show_all(event.client))
+        hub.on(
+            gui.add_button("Reset view", icon=viser.Icon.FOCUS_CENTERED, color="gray"),
+            lambda event: hub.scene.show_all(event.client),
+        )
         dark = gui.add_checkbox("Dark", hub.dark)
         hub.on(dark, lambda event: self._set_dark(bool(dark.value)))
         gui.add_html(
@@ -42,6 +48,9 @@ class Panel(BasePanel):
                 ]
             )
         )
+
+    def _set_layer(self, group: str, event: Any) -> None:
+        self.hub.scene.set_visible(group, bool(event.target.value))
 
     def _set_mode(self, mode: str) -> None:
         self.hub.mesh_wanted = mode != "Off"

@@ -1,0 +1,204 @@
+"""What every panel owes the hub, what the page shows of a run, and how quickly a control answers."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ecslam_app import server
+from ecslam_app.panel import TABS, BasePanel, find_panels
+from ecslam_app.panels.status import WORDS, render
+
+from ecslam import messages as m
+from tests.conftest import ROOT
+from tests.fake_engine import FakeEngine, write_run
+from tests.test_app_security import control, dial, enter, press, until
+
+PANELS = find_panels()
+
+
+@pytest.fixture
+def engine(tmp_path):
+    engine = FakeEngine(tmp_path / "run", frames=60, period=0.02)
+    yield engine
+    engine.stop()
+
+
+@pytest.fixture
+def page(engine):
+    page = server.start(engine, port=0)
+    yield page
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def replay_page(tmp_path_factory):
+    page = server.view([write_run(tmp_path_factory.mktemp("runs") / "a", 30)], port=0)
+    yield page
+    page.close()
+
+
+@pytest.mark.parametrize("panel", PANELS, ids=lambda p: p.__module__.rsplit(".")[-1])
+def test_panel_keeps_the_contract(panel):
+    assert issubclass(panel, BasePanel)
+    assert panel.tab in ("", *TABS)
+    assert panel.__doc__
+    assert sys.modules[panel.__module__].__doc__
+
+
+def test_every_tab_has_a_panel_and_no_two_share_a_place():
+    assert {p.tab for p in PANELS} >= set(TABS)
+    for hub_kind in (True, False):
+        shown = [(p.tab, p.order) for p in PANELS if p.applies(_Hub(hub_kind))]
+        assert len(shown) == len(set(shown))
+
+
+class _Hub:
+    def __init__(self, live):
+        self.replay = None if live else type("Replay", (), {"others": (1,)})
+
+
+def test_a_new_file_is_found(tmp_path, monkeypatch):
+    import ecslam_app.panels as folder
+
+    (tmp_path / "extra.py").write_text(
+        "from ecslam_app.panel import BasePanel\nclass Panel(BasePanel):\n    tab, order = 'View', 99\n"
+    )
+    monkeypatch.setattr(folder, "__path__", [*folder.__path__, str(tmp_path)])
+    assert any(p.__module__.endswith("extra") for p in find_panels())
+    sys.modules.pop("ecslam_app.panels.extra")
+
+
+def odd_snapshots(engine):
+    engine._advance()
+    for _ in range(12):
+        engine._advance()
+    s = engine.snapshot()
+    hole = s.trajectory_gt.copy()
+    hole[3:9] = np.nan
+    yield s
+    yield replace(s, trajectory_gt=None, ate_cm=None)
+    yield replace(s, trajectory_gt=hole)
+    yield replace(s, trajectory_gt=np.full_like(hole, np.nan), ate_cm=float("nan"))
+    yield replace(s, keyframes=(), window=(), color=None, losses={})
+    yield replace(s, frame=0, trajectory=s.trajectory[:1], loops=())
+    yield replace(s, state=m.State.FAILED, reason="the disk is full", sequence="<script>alert(1)</script>")
+
+
+def test_panels_and_scene_show_every_kind_of_snapshot(page, engine, caplog):
+    for s in odd_snapshots(engine):
+        done = threading.Event()
+        page.hub._take(s)
+        page.hub.post(done.set)
+        time.sleep(0.2)
+        assert done.wait(2)
+        assert until(lambda s=s: page.hub.current is s)
+    assert "could not carry out" not in caplog.text
+
+
+@pytest.mark.parametrize("state", list(m.State))
+def test_state_is_told_in_plain_words(engine, state):
+    engine._advance()
+    html = render(replace(engine.snapshot(), state=state, reason="why <b>"), "")
+    assert WORDS[state] in html
+    assert "why &lt;b&gt;" in html
+    assert "Frame <b>1</b> of 60" in html
+
+
+def test_controls_answer_at_once_while_the_page_is_busy(page, engine):
+    engine.start()
+    with dial(page) as client:
+        enter(client)
+        page.hub.post(lambda: time.sleep(1.5))
+        started = time.monotonic()
+        press(page, client, "Run", "Pause")
+        assert until(lambda: m.Pause() in engine.log, 1.0)
+        assert time.monotonic() - started < 0.2
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "command"),
+    [
+        ("Run", "Step", m.Step()), ("Run", "Stop", m.Stop()), ("Run to frame", True, m.RunTo(0)),
+        ("Speed limit", 12, m.SpeedLimit(12.0)), ("Pause on loop closure", True, m.PauseOnLoop(True)),
+        ("Restart", True, m.Restart("synthetic/studio", "lite", 0, "strict")),
+        ("Go on with this preset", True, m.LoadPreset("lite")),
+        ("Mapping iterations", 33, m.Tune("mapping.iterations", 33)),
+        ("Export mesh", True, m.Export("mesh", "ply", 0.02)),
+        ("Export trajectory", True, m.Export("trajectory", "tum")),
+        ("Export keyframes", True, m.Export("keyframes")), ("Export run as zip", True, m.Export("run", "zip")),
+        ("Export configuration", True, m.Export("config")),
+    ],
+)  # fmt: skip
+def test_each_control_sends_its_command(page, engine, label, value, command):
+    engine._thread.start()
+    engine._state = m.State.PAUSED
+    with dial(page) as client:
+        enter(client)
+        press(page, client, label, value)
+        assert until(lambda: command in engine.log)
+
+
+def test_live_only_controls_are_absent_from_a_replay(replay_page):
+    for label in ("Run", "Restart", "Mapping iterations", "Pause on loop closure"):
+        with pytest.raises(KeyError):
+            control(replay_page, label)
+
+
+def test_dashboard_imports_no_torch():
+    code = "import sys, ecslam_app.server, ecslam_app.panel as p; p.find_panels(); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+READER = """
+import sys, time
+from websockets.sync.client import connect
+import threading, msgspec, viser
+from tests.test_app_security import CAMERA
+port, count = int(sys.argv[1]), int(sys.argv[2])
+def read():
+    with connect(f"ws://127.0.0.1:{port}/", origin=f"http://127.0.0.1:{port}",
+                 subprotocols=[f"viser-v{viser.__version__}"],
+                 max_size=None, compression=None) as c:
+        c.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **CAMERA}))
+        for _ in c: pass
+for _ in range(count): threading.Thread(target=read, daemon=True).start()
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.slow
+def test_twenty_viewers_do_not_slow_the_engine(tmp_path):
+    if os.getloadavg()[0] > os.cpu_count():
+        pytest.skip("the machine is busy with other work: a ratio of rates would say nothing")
+    engine = FakeEngine(tmp_path / "run", frames=4000, period=0.02).start()
+    page = server.start(engine, port=0)
+
+    def rate(seconds=3.0):
+        first = engine.latest().frame
+        time.sleep(seconds)
+        return (engine.latest().frame - first) / seconds
+
+    time.sleep(1.5)
+    alone = rate()
+    readers = subprocess.Popen([sys.executable, "-c", READER, str(page.port), "20"], stdout=subprocess.PIPE, cwd=ROOT)
+    try:
+        readers.stdout.readline()
+        assert until(lambda: len(page.hub.server._websock_server._client_state_from_id) == 20, 30)
+        assert until(lambda: len(list(page.hub.viewers())) == 20, 30)
+        time.sleep(1)
+        watched = rate()
+    finally:
+        readers.kill()
+        readers.wait()
+        page.close()
+        engine.stop()
+    print(f"frames/s alone {alone:.1f}, with 20 viewers {watched:.1f}, ratio {watched / alone:.2f}")
+    assert watched >= 0.9 * alone

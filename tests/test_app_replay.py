@@ -1,0 +1,221 @@
+"""Finished runs: reading folders, scrubbing, exporting, comparing, and the formats that leave the dashboard."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import trimesh
+from ecslam_app import server
+from ecslam_app.geometry import overview, rotation_difference_deg, rotation_to, up_direction
+from ecslam_app.glb import simplify, to_glb, vertex_normals
+from ecslam_app.history import History
+from ecslam_app.record import html_replay
+from ecslam_app.replay import ReplayEngine
+from ecslam_app.runs import kitti_lines, load_mesh, load_run, tum_lines
+
+from ecslam import messages as m
+from ecslam.runtime.protocol import EngineHandle
+from ecslam.types import InputError, Mesh
+from tests.fake_engine import FakeEngine, room_mesh, walk, write_run
+from tests.test_app_security import until
+
+FRAMES = 40
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_run(tmp_path_factory.mktemp("runs") / "lite", FRAMES)
+
+
+@pytest.fixture
+def replay(folder):
+    engine = ReplayEngine(load_run(folder))
+    yield engine
+    engine.close()
+
+
+def events(engine, kind, command):
+    feed = engine.subscribe()
+    number = engine.submit(command)
+    found, answered = None, None
+    while answered is None:
+        thing = feed.get(5)
+        assert thing is not None, f"no answer to {command}"
+        found = thing if isinstance(thing, kind) else found
+        answered = thing if isinstance(thing, m.Ack) and thing.command_id == number else None
+    feed.close()
+    return found, answered
+
+
+def test_replay_is_an_engine(replay, tmp_path):
+    assert isinstance(replay, EngineHandle)
+    assert isinstance(FakeEngine(tmp_path), EngineHandle)
+
+
+def test_run_is_read_whole(folder):
+    run = load_run(folder)
+    assert len(run.rows) == len(run.trajectory) == FRAMES
+    assert np.allclose(run.trajectory_gt, walk(FRAMES), atol=1e-6)
+    assert [e.frame for e in run.loops] == [int(0.9 * FRAMES)]
+    assert [k.frame for k in run.keyframes] == list(range(0, FRAMES, 5))
+
+
+@pytest.mark.parametrize("frame", [0, 7, FRAMES - 1, 10_000, -3])
+def test_scrubbing_shows_what_was_there_at_that_frame(replay, frame):
+    _, ack = events(replay, m.Snapshot, m.RunTo(frame))
+    s, at = replay.latest(), min(max(frame, 0), FRAMES - 1)
+    assert ack.error == ""
+    assert (s.frame, len(s.trajectory)) == (at, at + 1)
+    assert all(k.frame <= at for k in s.keyframes)
+    assert all(e.frame <= at for e in s.loops)
+    assert set(s.window) <= {k.frame for k in s.keyframes}
+
+
+def test_play_runs_to_the_end_and_step_moves_by_one(replay):
+    events(replay, m.Snapshot, m.SpeedLimit(60.0))
+    events(replay, m.Snapshot, m.RunTo(FRAMES - 6))
+    events(replay, m.Snapshot, m.Step())
+    assert replay.latest().frame == FRAMES - 5
+    assert replay.latest().state is m.State.PAUSED
+    events(replay, m.Snapshot, m.Resume())
+    assert until(lambda: replay.latest().state is m.State.FINISHED)
+    assert replay.latest().frame == FRAMES - 1
+
+
+@pytest.mark.parametrize("command", [m.Restart(), m.Tune("mapping.rays", 3), m.Export("mesh", "exe"), m.Export("soul")])
+def test_what_a_replay_cannot_do_is_refused_in_one_line(replay, command):
+    _, ack = events(replay, m.Exported, command)
+    assert ack.error
+    assert "\n" not in ack.error
+
+
+def test_exports(replay, folder):
+    mesh = trimesh.load_mesh(events(replay, m.Exported, m.Export("mesh", "ply"))[0].path, process=False)
+    assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
+    tum = np.loadtxt(events(replay, m.Exported, m.Export("trajectory", "tum"))[0].path)
+    assert np.allclose(tum[:, 1:4], load_run(folder).trajectory[:, :3, 3], atol=1e-6)
+    kitti = np.loadtxt(events(replay, m.Exported, m.Export("trajectory", "kitti"))[0].path)
+    assert np.allclose(kitti.reshape(-1, 3, 4), load_run(folder).trajectory[:, :3])
+    with zipfile.ZipFile(events(replay, m.Exported, m.Export("run", "zip"))[0].path) as archive:
+        assert {"metrics.jsonl", "mesh.ply", "summary.json"} <= set(archive.namelist())
+        assert not any(name.startswith("exports") for name in archive.namelist())
+
+
+def test_killed_run_with_a_cut_line_opens(folder, tmp_path):
+    (tmp_path / "metrics.jsonl").write_bytes((folder / "metrics.jsonl").read_bytes()[:-40])
+    run = load_run(tmp_path)
+    assert len(run.rows) == FRAMES - 1
+    assert (run.trajectory_gt, run.loops, run.meshes) == (None, (), {})
+
+
+@pytest.mark.parametrize("content", [None, "", "not json\n"])
+def test_what_is_no_run_is_a_clear_error(tmp_path, content):
+    if content is not None:
+        (tmp_path / "metrics.jsonl").write_text(content)
+    with pytest.raises(InputError, match="run"):
+        load_run(tmp_path)
+
+
+def test_thumbnail_outside_the_run_is_not_read(folder, tmp_path):
+    for name in ("metrics.jsonl", "summary.json"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    (tmp_path / "keyframes.jsonl").write_text(json.dumps({"frame": 0, "thumbnail": "../../../../etc/hostname"}) + "\n")
+    assert not load_run(tmp_path).keyframes[0].thumbnail.any()
+
+
+def test_runs_on_different_sequences_are_not_compared(folder, tmp_path):
+    other = write_run(tmp_path / "other", 20)
+    (other / "summary.json").write_text(json.dumps({"sequence": "synthetic/corridor"}))
+    with pytest.raises(InputError, match="different sequences"):
+        server.view([folder, other], port=0)
+
+
+def test_html_replay_is_one_file_without_addresses_of_others(replay, tmp_path):
+    page = html_replay(replay.latest(), room_mesh(0.3), replay.history, dark=False)
+    assert "__VISER_EMBED_DATA__" in page
+    assert "http://localhost" not in page
+
+
+def test_tum_lines_leave_out_what_is_missing():
+    poses = walk(4)
+    poses[2] = np.nan
+    assert len(tum_lines(np.arange(4), poses).splitlines()) == 3
+    assert len(kitti_lines(walk(4)).splitlines()) == 4
+
+
+# ---- what is drawn ------------------------------------------------------------------------------------------------
+
+
+def test_glb_is_read_back_by_trimesh():
+    mesh = room_mesh(0.3)
+    scene = trimesh.load(io.BytesIO(to_glb(mesh, mesh.colors)), file_type="glb", process=False)
+    back = next(iter(scene.geometry.values()))
+    assert np.allclose(back.vertices, mesh.vertices, atol=1e-6)
+    assert np.array_equal(back.faces, mesh.faces)
+    edges = trimesh.load(io.BytesIO(to_glb(mesh, mesh.colors, wireframe=True)), file_type="glb", process=False)
+    assert len(edges.geometry) == 1
+
+
+@pytest.mark.parametrize("triangles", [500, 5000, 10**6])
+def test_simplified_mesh_keeps_shape_within_budget(triangles):
+    mesh = room_mesh(0.1)
+    small = simplify(mesh, triangles)
+    assert 0 < len(small.faces) <= triangles
+    assert np.allclose(small.vertices.min(0), mesh.vertices.min(0), atol=0.3)
+    assert small.faces.max() < len(small.vertices)
+    area = [trimesh.Trimesh(x.vertices, x.faces, process=False).area for x in (mesh, small)]
+    assert area[1] == pytest.approx(area[0], rel=0.3)
+
+
+def test_normals_of_a_sphere_point_outwards():
+    ball = trimesh.creation.icosphere(3)
+    mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
+    assert np.allclose(vertex_normals(mesh), ball.vertices, atol=0.02)
+
+
+def test_up_is_found_and_the_first_view_shows_the_whole_box():
+    poses, low, high = walk(50), np.array([-3.0, -2, 0]), np.array([3.0, 2, 2.5])
+    up = up_direction(poses)
+    assert np.allclose(up, [0, 0, 1])
+    position, look_at = overview(low, high, up, 1.6, 1.3)
+    forward = (look_at - position) / np.linalg.norm(look_at - position)
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - position
+    angles = np.degrees(np.arccos(corners @ forward / np.linalg.norm(corners, axis=1)))
+    assert angles.max() < np.degrees(np.arctan(np.tan(0.65) * np.hypot(1, 1.6)))
+    assert position[2] > high[2]
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, -1, 0], [0.6, 0, 0.8]])
+def test_grid_is_turned_to_up(up):
+    import viser.transforms as vt
+
+    assert np.allclose(vt.SO3(rotation_to(np.array(up, float))).apply(np.array([0, 0, 1.0])), up, atol=1e-9)
+
+
+def test_rotation_difference():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    turned = poses.copy()
+    angle = np.radians(30)
+    turned[1, :2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    turned[2] = np.nan
+    assert np.allclose(rotation_difference_deg(poses, turned), [0, 30, np.nan], equal_nan=True)
+
+
+def test_history_thins_and_fills_gaps():
+    history = History()
+    for frame in range(1000):
+        history.add(frame, {"ate_cm": float(frame)} if frame % 2 else {}, {}, (frame,) if frame % 10 == 0 else ())
+    frames, ate = history.series(["ate_cm"], most=100)
+    assert len(frames) <= 101
+    assert np.isnan(ate[frames % 2 == 0]).all()
+    assert history.window_at(57) == (50,)
+
+
+def test_load_mesh_refuses_what_is_none(tmp_path):
+    (tmp_path / "mesh.ply").write_text("ply\nnonsense")
+    with pytest.raises(InputError, match="mesh"):
+        load_mesh(tmp_path / "mesh.ply")
