@@ -17,17 +17,19 @@ from ._cpu_simd import (
     gather,
     highest,
     isplat,
+    lanes,
     load,
     lowest,
     make_tile,
     power_of_two,
     row_sums,
+    same_bits,
     scatter_add,
+    slide,
     splat,
     store,
     to_int,
     transpose,
-    where_equal,
     where_positive,
 )
 
@@ -35,6 +37,7 @@ OUTER = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", 
 INNER = {**OUTER, "cache": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 BOTH = 64
 HALF = 32
+BLOCK = 32  # points whose hidden units stay in the first-level cache through all passes
 P1, P2 = -1640531535, 805459861
 OFFSET, MASK, FIRST, DIMS = 0, 1, 2, 5
 ANCHOR, BLOB_LOW, BLOB_INV, LOW, HIGH = 0, 3, 6, 9, 12
@@ -45,8 +48,8 @@ tile_add = make_tile(4, 2, True, False)
 
 
 class Grid(NamedTuple):
-    """A GridLayout as jitted code reads it: levels int32 [L, 8] (offset, mask, first, dims), inverse voxel sizes [L],
-    geometry float32 [15] (anchor, blob low, 1 / blob size, box low, box high), one-blob bins."""
+    """A GridLayout as jitted code reads it: levels int32 [L, 8] (offset, mask, first, dims), inverse voxel sizes [L, 2]
+    and geometry [15] (anchor, blob low, 1 / blob size, box low, box high) in float64, one-blob bins."""
 
     levels: np.ndarray
     inverse: np.ndarray
@@ -56,22 +59,27 @@ class Grid(NamedTuple):
 
 class Net(NamedTuple):
     """The decoders as jitted code reads them, flat. features: [padded, 64]; features_t: [64, padded]; blob:
-    [3, bins + 2, 64], wrapped around; sdf: [32]; rgb: [3, 32]. padded: number of hash features, padded to 16."""
+    [3, bins + 2, 64], wrapped around; blob_steps: its differences
+    between rows; sdf: [32]; rgb: [3, 32]. padded: number of hash features, padded to 16."""
 
     features: np.ndarray
     features_t: np.ndarray
     blob: np.ndarray
+    blob_steps: np.ndarray
     sdf: np.ndarray
     rgb: np.ndarray
     padded: int
 
 
 class Scratch(NamedTuple):
-    """What a chunk of ``pitch`` points needs, flat. x: position from the anchor [3]; inside: 1 or 0 per axis [3];
+    """What a chunk of ``pitch`` points needs, flat. world: positions float64 [3]; x: positions from the anchor on the
+    box, rounded, and what rounding lost [6]; inside: 1 or 0 per axis [3];
     enc: features [padded]; jac: their derivatives per metre [3 padded]; bin: first of three bins [3]; coef: bin values
     [9]; slope: d(bin value)/dx at the outer two [6]; hidden: [pitch, 64]; out: TSDF, colour [4]; up: gradients of
-    those before the sigmoid [4]; d_enc [padded]; d_x [3]; turn [8, padded]; alpha, before, weight, sharp: rendering."""
+    those before the sigmoid [4]; d_enc [padded]; d_x [3]; turn: for transposing; alpha, before, weight, sharp: rendering.
+    rows: corners of eight cells [64]."""
 
+    world: np.ndarray
     x: np.ndarray
     inside: np.ndarray
     enc: np.ndarray
@@ -89,18 +97,20 @@ class Scratch(NamedTuple):
     before: np.ndarray
     weight: np.ndarray
     sharp: np.ndarray
+    rows: np.ndarray
 
 
 def scratch_floats(pitch, padded):
     """Sizes of the two flat buffers that ``carve`` cuts up: what a chunk leaves behind, and the rest."""
-    return pitch * (3 + padded), pitch * (4 * padded + 3 + 3 + 9 + 6 + BOTH + 4 + 4 + 3 + 4) + 8 * padded
+    return pitch * (6 + padded), pitch * (4 * padded + 6 + 3 + 3 + 9 + 6 + BOTH + 4 + 4 + 3 + 4) + 8 * padded + 256
 
 
 @njit(**INNER)
 def carve(kept, buffer, pitch, padded):
     """A Scratch inside flat buffers: positions and feature gradients (for ``table_back``) in ``kept``."""
-    x, d_enc = kept[: 3 * pitch], kept[3 * pitch :]
-    at = 0
+    x, d_enc = kept[: 6 * pitch], kept[6 * pitch :]
+    world = buffer[: 6 * pitch].view(np.float64)
+    at = 6 * pitch
     inside = buffer[at : at + 3 * pitch]
     at += 3 * pitch
     enc = buffer[at : at + padded * pitch]
@@ -121,32 +131,56 @@ def carve(kept, buffer, pitch, padded):
     at += 4 * pitch
     d_x = buffer[at : at + 3 * pitch]
     at += 3 * pitch
-    turn = buffer[at : at + 8 * padded]
-    at += 8 * padded
+    turn = buffer[at : at + 8 * padded + 192]
+    at += 8 * padded + 192
     rest = buffer[at : at + 4 * pitch]
+    rows = buffer[at + 4 * pitch : at + 4 * pitch + 64].view(np.int32)
     alpha, before, weight, sharp = rest[:pitch], rest[pitch : 2 * pitch], rest[2 * pitch : 3 * pitch], rest[3 * pitch :]
     return Scratch(
-        x, inside, enc, jac, bins, coef, slope, hidden, out, up, d_enc, d_x, turn, alpha, before, weight, sharp
+        world,
+        x,
+        inside,
+        enc,
+        jac,
+        bins,
+        coef,
+        slope,
+        hidden,
+        out,
+        up,
+        d_enc,
+        d_x,
+        turn,
+        alpha,
+        before,
+        weight,
+        sharp,
+        rows,
     )
 
 
 @njit(**INNER)
 def place(grid, s, n, pitch):
-    """Clamp world positions in ``s.x`` onto the box, note which axes moved, find the one-blob bins and their values."""
+    """Clamp world positions onto the box, note which axes moved, find the one-blob bins and their values."""
+    g = grid.geometry
+    for axis in range(3):
+        anchor, low, high = g[ANCHOR + axis], g[LOW + axis], g[HIGH + axis]
+        for i in range(axis * pitch, axis * pitch + n):
+            world = s.world[i]
+            x = min(max(world, low), high)
+            s.inside[i] = x == world
+            x -= anchor
+            s.x[i] = x
+            s.x[3 * pitch + i] = x - np.float64(s.x[i])
     bins, one = grid.bins, splat(np.float32(1))
     third, fifth = splat(np.float32(-2 / 3)), splat(np.float32(0.2))
     for axis in range(3):
-        g = grid.geometry
-        low, high, anchor = splat(g[LOW + axis]), splat(g[HIGH + axis]), splat(g[ANCHOR + axis])
-        start, inverse = splat(g[BLOB_LOW + axis]), splat(g[BLOB_INV + axis])
+        start, inverse = splat(g[BLOB_LOW + axis] - g[ANCHOR + axis]), splat(g[BLOB_INV + axis])
         scale = splat(np.float32(0.9375))
-        steep = splat(np.float32(0.9375) * bins * g[BLOB_INV + axis])
+        steep = splat(0.9375 * bins * g[BLOB_INV + axis])
         for p in range(0, n, 8):
             at = axis * pitch + p
-            world = load(s.x, at)
-            x = lowest(highest(world, low), high)
-            store(s.inside, at, where_equal(x, world, one))
-            store(s.x, at, x - anchor)
+            x = load(s.x, at)
             u = (x - start) * inverse
             t = (u - floor(u)) * splat(np.float32(bins))
             c = lowest(floor(t), splat(np.float32(bins - 1)))
@@ -164,37 +198,68 @@ def place(grid, s, n, pitch):
 
 
 @njit(**INNER)
-def corners(levels, level, x, y, z):
-    """Table rows of the eight corners (x fastest) of the cell with integer coordinates x, y, z."""
+def split(x, rest, inverse, lost):
+    """Cell coordinate and fraction of a position x + rest with inverse voxel size inverse + lost, as if in float64: the
+    derivative of the field jumps where the cell changes."""
+    cell = floor(x * inverse)
+    fraction = fma(x, inverse, splat(np.float32(0)) - cell) + fma(rest, inverse, x * lost)
+    over = floor(fraction)
+    return cell + over, fraction - over
+
+
+@njit(**INNER)
+def locate(grid, level, x, at, pitch):
+    """Cell of the points x[:, at : at + 8] at one level: integer coordinates and fractions."""
+    g, inverse, lost = grid.levels, splat(grid.inverse[level, 0]), splat(grid.inverse[level, 1])
+    cx, fx = split(load(x, at), load(x, 3 * pitch + at), inverse, lost)
+    cy, fy = split(load(x, pitch + at), load(x, 4 * pitch + at), inverse, lost)
+    cz, fz = split(load(x, 2 * pitch + at), load(x, 5 * pitch + at), inverse, lost)
+    if g[level, DIMS] > 0:  # rounding must not leave the stored block
+        cx, fx = inside_block(cx, fx, g[level, FIRST], g[level, DIMS])
+        cy, fy = inside_block(cy, fy, g[level, FIRST + 1], g[level, DIMS + 1])
+        cz, fz = inside_block(cz, fz, g[level, FIRST + 2], g[level, DIMS + 2])
+    return to_int(cx), to_int(cy), to_int(cz), fx, fy, fz
+
+
+@njit(**INNER)
+def inside_block(cell, fraction, first, count):
+    """Clamp cell coordinates to the cells between ``count`` lattice points."""
+    clamped = lowest(highest(cell, splat(np.float32(first))), splat(np.float32(first + count - 2)))
+    return clamped, fraction + (cell - clamped)
+
+
+@njit(**INNER)
+def corners(levels, level, x, y, z, rows):
+    """Table rows [8, 8] of the eight corners (x fastest) of eight cells with integer coordinates x, y, z."""
     one, offset = isplat(1), isplat(levels[level, OFFSET])
-    nx, ny, nz = levels[level, DIMS], levels[level, DIMS + 1], levels[level, DIMS + 2]
+    nx, ny = levels[level, DIMS], levels[level, DIMS + 1]
     if nx > 0:
-        zero = isplat(0)
-        x = x - isplat(levels[level, FIRST])
-        y = y - isplat(levels[level, FIRST + 1])
-        z = z - isplat(levels[level, FIRST + 2])
-        ex, ey, ez = isplat(nx - 1), isplat(ny - 1), isplat(nz - 1)
         row, slab = isplat(nx), isplat(nx * ny)
-        x0, x1 = lowest(highest(x, zero), ex), lowest(highest(x + one, zero), ex)
-        y0, y1 = lowest(highest(y, zero), ey) * row, lowest(highest(y + one, zero), ey) * row
-        z0, z1 = lowest(highest(z, zero), ez) * slab + offset, lowest(highest(z + one, zero), ez) * slab + offset
-        a, b, c, d = y0 + z0, y1 + z0, y0 + z1, y1 + z1
-        return a + x0, a + x1, b + x0, b + x1, c + x0, c + x1, d + x0, d + x1
-    mask = isplat(levels[level, MASK])
-    y0, z0 = y * isplat(P1), z * isplat(P2)
-    y1, z1 = y0 + isplat(P1), z0 + isplat(P2)
-    a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
-    x1 = x + one
-    return (
-        ((a ^ x) & mask) + offset,
-        ((a ^ x1) & mask) + offset,
-        ((b ^ x) & mask) + offset,
-        ((b ^ x1) & mask) + offset,
-        ((c ^ x) & mask) + offset,
-        ((c ^ x1) & mask) + offset,
-        ((d ^ x) & mask) + offset,
-        ((d ^ x1) & mask) + offset,
-    )
+        first = levels[level, FIRST] + nx * (levels[level, FIRST + 1] + ny * levels[level, FIRST + 2])
+        a = x + y * row + z * slab + (offset - isplat(first))
+        b, c = a + row, a + slab
+        d = c + row
+        store(rows, 0, a)
+        store(rows, 8, a + one)
+        store(rows, 16, b)
+        store(rows, 24, b + one)
+        store(rows, 32, c)
+        store(rows, 40, c + one)
+        store(rows, 48, d)
+        store(rows, 56, d + one)
+    else:
+        mask, x1 = isplat(levels[level, MASK]), x + one
+        y0, z0 = y * isplat(P1), z * isplat(P2)
+        y1, z1 = y0 + isplat(P1), z0 + isplat(P2)
+        a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+        store(rows, 0, ((a ^ x) & mask) + offset)
+        store(rows, 8, ((a ^ x1) & mask) + offset)
+        store(rows, 16, ((b ^ x) & mask) + offset)
+        store(rows, 24, ((b ^ x1) & mask) + offset)
+        store(rows, 32, ((c ^ x) & mask) + offset)
+        store(rows, 40, ((c ^ x1) & mask) + offset)
+        store(rows, 48, ((d ^ x) & mask) + offset)
+        store(rows, 56, ((d ^ x1) & mask) + offset)
 
 
 @njit(**INNER)
@@ -212,15 +277,24 @@ def mix(v, fx, fy, fz):
 @njit(**INNER)
 def encode(grid, table, s, n, pitch, padded, want_jac):
     """Hash features of the points in ``s.x`` (paper, equation 1) and, if wanted, their derivatives."""
+    rows = s.rows
     for level in range(grid.levels.shape[0]):
-        inverse = splat(grid.inverse[level])
+        inverse = splat(grid.inverse[level, 0])
         for p in range(0, n, 8):
-            x, y, z = load(s.x, p) * inverse, load(s.x, pitch + p) * inverse, load(s.x, 2 * pitch + p) * inverse
-            cx, cy, cz = floor(x), floor(y), floor(z)
-            fx, fy, fz = x - cx, y - cy, z - cz
-            k = corners(grid.levels, level, to_int(cx), to_int(cy), to_int(cz))
-            a, b, c, d = gather(table, k[0]), gather(table, k[1]), gather(table, k[2]), gather(table, k[3])
-            e, f, g, h = gather(table, k[4]), gather(table, k[5]), gather(table, k[6]), gather(table, k[7])
+            x, y, z, fx, fy, fz = locate(grid, level, s.x, p, pitch)
+            corners(grid.levels, level, x, y, z, rows)
+            a, b, c, d = (
+                gather(table, rows, 0),
+                gather(table, rows, 8),
+                gather(table, rows, 16),
+                gather(table, rows, 24),
+            )
+            e, f, g, h = (
+                gather(table, rows, 32),
+                gather(table, rows, 40),
+                gather(table, rows, 48),
+                gather(table, rows, 56),
+            )
             v0, x0, y0, z0 = mix((a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0]), fx, fy, fz)
             v1, x1, y1, z1 = mix((a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1]), fx, fy, fz)
             at = 2 * level * pitch + p
@@ -236,9 +310,9 @@ def encode(grid, table, s, n, pitch, padded, want_jac):
 
 
 @njit(**INNER)
-def blob_layer(blob, bins, s, n, pitch):
-    """First-layer sums of the one-blob inputs: starts ``s.hidden``."""
-    for p in range(n):
+def blob_layer(blob, bins, s, first, last, pitch):
+    """First-layer sums of the one-blob inputs of points first..last: starts ``s.hidden``."""
+    for p in range(first, last):
         i = BOTH * s.bin[p]
         j = BOTH * (s.bin[pitch + p] + bins + 2)
         k = BOTH * (s.bin[2 * pitch + p] + 2 * (bins + 2))
@@ -312,9 +386,9 @@ def sigmoid(x):
 
 
 @njit(**INNER)
-def decode(net, s, n, pitch):
-    """TSDF and colour of the points from ``s.hidden``."""
-    for p in range(0, n, 8):
+def decode(net, s, first, last, pitch):
+    """TSDF and colour of points first..last from ``s.hidden``."""
+    for p in range(first, last, 8):
         store(s.out, p, dots(s.hidden, BOTH * p, net.sdf, 0))
         for channel in range(3):
             raw = dots(s.hidden, BOTH * p + HALF, net.rgb, HALF * channel)
@@ -323,23 +397,26 @@ def decode(net, s, n, pitch):
 
 @njit(**INNER)
 def forward(grid, table, net, s, n, pitch, want_jac):
-    """From world positions in ``s.x`` to TSDF and colour in ``s.out``; n is a multiple of 8."""
+    """From world positions in ``s.world`` to TSDF and colour in ``s.out``; n is a multiple of 8."""
     place(grid, s, n, pitch)
     s.enc[2 * grid.levels.shape[0] * pitch :] = 0
     encode(grid, table, s, n, pitch, net.padded, want_jac)
-    blob_layer(net.blob, grid.bins, s, n, pitch)
-    for p in range(0, n, 4):
-        for v in range(0, BOTH, 16):
-            tile_relu(s.hidden, BOTH * p + v, BOTH, s.enc, p, 1, pitch, net.features, v, BOTH, net.padded)
-    decode(net, s, n, pitch)
+    for first in range(0, n, BLOCK):
+        last = min(first + BLOCK, n)
+        blob_layer(net.blob, grid.bins, s, first, last, pitch)
+        for p in range(first, last, 4):
+            for v in range(0, BOTH, 16):
+                tile_relu(s.hidden, BOTH * p + v, BOTH, s.enc, p, 1, pitch, net.features, v, BOTH, net.padded)
+        decode(net, s, first, last, pitch)
 
 
 @njit(**INNER)
-def hidden_back(net, s, n, pitch, d_sdf, d_rgb):
-    """Turn hidden activations into their gradients in place, from ``s.up``; adds the second layer's gradients."""
+def hidden_back(net, s, first, last, pitch, d_sdf, d_rgb):
+    """Turn hidden activations of points first..last into their gradients in place, from ``s.up``; adds the second
+    layer's gradients."""
     for v in range(0, HALF, 8):
         w, total = load(net.sdf, v), load(d_sdf, v)
-        for p in range(n):
+        for p in range(first, last):
             h, g = load(s.hidden, BOTH * p + v), splat(s.up[p])
             total = total + g * h
             store(s.hidden, BOTH * p + v, where_positive(h, g * w))
@@ -347,7 +424,7 @@ def hidden_back(net, s, n, pitch, d_sdf, d_rgb):
     for v in range(0, HALF, 8):
         wr, wg, wb = load(net.rgb, v), load(net.rgb, HALF + v), load(net.rgb, 2 * HALF + v)
         tr, tg, tb = load(d_rgb, v), load(d_rgb, HALF + v), load(d_rgb, 2 * HALF + v)
-        for p in range(n):
+        for p in range(first, last):
             h = load(s.hidden, BOTH * p + HALF + v)
             r, g, b = splat(s.up[pitch + p]), splat(s.up[2 * pitch + p]), splat(s.up[3 * pitch + p])
             tr, tg, tb = tr + r * h, tg + g * h, tb + b * h
@@ -358,94 +435,150 @@ def hidden_back(net, s, n, pitch, d_sdf, d_rgb):
 
 
 @njit(**INNER)
-def features_back(net, s, n, pitch, first, last):
-    """Gradients of the hash features from hidden units first..last of ``s.hidden``, into ``s.d_enc``."""
+def features_back(net, s, first, last, pitch, begin, end):
+    """Gradients of the hash features of points first..last from hidden units begin..end, into ``s.d_enc``."""
     padded = net.padded
-    for p in range(0, n, 8):
+    for p in range(first, last, 8):
         for i in range(0, 8, 4):
             for v in range(0, padded, 16):
                 tile_set(
-                    s.turn, i * padded + v, padded, s.hidden, BOTH * (p + i) + first, BOTH, 1,
-                    net.features_t, first * padded + v, padded, last - first,
+                    s.turn, i * padded + v, padded, s.hidden, BOTH * (p + i) + begin, BOTH, 1,
+                    net.features_t, begin * padded + v, padded, end - begin,
                 )  # fmt: skip
         for v in range(0, padded, 8):
             transpose(s.turn, v, padded, s.d_enc, v * pitch + p, pitch)
 
 
 @njit(**INNER)
-def blob_slope(blob, at, g0, g1, hidden, h, first, last):
-    """Lane-wise partial sums of the derivative along one axis through the one-blob inputs."""
-    left, right = splat(g0), splat(g1)
-    total = splat(np.float32(0))
-    for v in range(first, last, 8):
-        a, b, c = load(blob, at + v), load(blob, at + v + BOTH), load(blob, at + v + 2 * BOTH)
-        total = total + load(hidden, h + v) * (left * (b - a) + right * (c - b))
-    return total
+def blob_back(blob, bins, s, p, pitch, begin, end):
+    """Derivatives of one point's TSDF and colour along the three axes through the one-blob inputs: their lane-wise
+    partial sums go to ``s.turn`` [3, 8, 8]."""
+    i = BOTH * s.bin[p]
+    j = BOTH * (s.bin[pitch + p] + bins + 2)
+    k = BOTH * (s.bin[2 * pitch + p] + 2 * (bins + 2))
+    a, b, c = splat(s.slope[p]), splat(s.slope[2 * pitch + p]), splat(s.slope[4 * pitch + p])
+    d, e, f = splat(s.slope[pitch + p]), splat(s.slope[3 * pitch + p]), splat(s.slope[5 * pitch + p])
+    x = y = z = splat(np.float32(0))
+    for v in range(begin, end, 8):
+        g = load(s.hidden, BOTH * p + v)
+        x = x + g * (a * load(blob, i + v) + d * load(blob, i + v + BOTH))
+        y = y + g * (b * load(blob, j + v) + e * load(blob, j + v + BOTH))
+        z = z + g * (c * load(blob, k + v) + f * load(blob, k + v + BOTH))
+    at = 8 * (p & 7)
+    store(s.turn, at, x)
+    store(s.turn, at + 64, y)
+    store(s.turn, at + 128, z)
 
 
 @njit(**INNER)
-def points_back(grid, net, s, n, pitch, first, last):
-    """Gradients of the positions, into ``s.d_x``, from ``s.d_enc`` and hidden units first..last of ``s.hidden``."""
-    blob, bins = net.blob, grid.bins
-    for axis in range(3):
-        jac = axis * net.padded * pitch
-        base = axis * (bins + 2)
-        for p in range(0, n, 8):
-            total = splat(np.float32(0))
-            for i in range(2 * grid.levels.shape[0]):
-                total = total + load(s.d_enc, i * pitch + p) * load(s.jac, jac + i * pitch + p)
-            for i in range(8):
-                q = p + i
-                at = BOTH * (s.bin[axis * pitch + q] + base)
-                g0, g1 = s.slope[2 * axis * pitch + q], s.slope[(2 * axis + 1) * pitch + q]
-                store(s.turn, 8 * i, blob_slope(blob, at, g0, g1, s.hidden, BOTH * q, first, last))
-            t = s.turn
-            total = total + row_sums(
-                load(t, 0), load(t, 8), load(t, 16), load(t, 24), load(t, 32), load(t, 40), load(t, 48), load(t, 56)
-            )
-            store(s.d_x, axis * pitch + p, total * load(s.inside, axis * pitch + p))
+def eight_sums(a, i):
+    """The sums of eight consecutive rows of eight."""
+    return row_sums(
+        load(a, i), load(a, i + 8), load(a, i + 16), load(a, i + 24),
+        load(a, i + 32), load(a, i + 40), load(a, i + 48), load(a, i + 56),
+    )  # fmt: skip
 
 
 @njit(**INNER)
-def weights_back(grid, net, s, n, pitch, d_features, d_blob):
-    """Add the first layer's gradients: d_features [padded, 64], d_blob [3, bins + 2, 64]."""
+def points_back(grid, net, s, first, last, pitch, begin, end):
+    """Position gradients of points first..last, into ``s.d_x``, from ``s.d_enc`` and hidden units begin..end."""
+    features, jac = 2 * grid.levels.shape[0], net.padded * pitch
+    for p in range(first, last, 8):
+        x = y = z = splat(np.float32(0))
+        for i in range(p, p + features * pitch, pitch):
+            g = load(s.d_enc, i)
+            x = x + g * load(s.jac, i)
+            y = y + g * load(s.jac, i + jac)
+            z = z + g * load(s.jac, i + 2 * jac)
+        for q in range(p, p + 8):
+            blob_back(net.blob_steps, grid.bins, s, q, pitch, begin, end)
+        x, y, z = x + eight_sums(s.turn, 0), y + eight_sums(s.turn, 64), z + eight_sums(s.turn, 128)
+        store(s.d_x, p, x * load(s.inside, p))
+        store(s.d_x, pitch + p, y * load(s.inside, pitch + p))
+        store(s.d_x, 2 * pitch + p, z * load(s.inside, 2 * pitch + p))
+
+
+@njit(**INNER)
+def weights_back(grid, net, s, first, last, pitch, d_features, d_blob):
+    """Add the first layer's gradients from points first..last: d_features [padded, 64], d_blob [3, bins + 2, 64]."""
     for v in range(0, BOTH, 16):
         for i in range(0, net.padded, 4):
-            tile_add(d_features, BOTH * i + v, BOTH, s.enc, i * pitch, pitch, 1, s.hidden, v, BOTH, n)
+            tile_add(
+                d_features, BOTH * i + v, BOTH, s.enc, i * pitch + first, pitch, 1,
+                s.hidden, BOTH * first + v, BOTH, last - first,
+            )  # fmt: skip
     for axis in range(3):
-        base = axis * (grid.bins + 2)
-        for p in range(n):
-            at = BOTH * (s.bin[axis * pitch + p] + base)
-            a = splat(s.coef[3 * axis * pitch + p])
-            b = splat(s.coef[(3 * axis + 1) * pitch + p])
-            c = splat(s.coef[(3 * axis + 2) * pitch + p])
-            for v in range(0, BOTH, 8):
-                g = load(s.hidden, BOTH * p + v)
-                store(d_blob, at + v, load(d_blob, at + v) + a * g)
-                store(d_blob, at + v + BOTH, load(d_blob, at + v + BOTH) + b * g)
-                store(d_blob, at + v + 2 * BOTH, load(d_blob, at + v + 2 * BOTH) + c * g)
+        for v in range(0, BOTH, 16):
+            blob_weights_back(s, first, last, pitch, axis, v, d_blob[axis * (grid.bins + 2) * BOTH :])
 
 
 @njit(**INNER)
-def corner_pair(d_table, left, right, gx, fx, weight, a, b):
-    """Scatter the gradients a, b to two corners that are neighbours along x."""
-    low, high = weight * gx, weight * fx
-    scatter_add(d_table, left, low * a, low * b)
-    scatter_add(d_table, right, high * a, high * b)
+def blob_weights_back(s, first, last, pitch, axis, v, d_blob):
+    """Sixteen columns of ``weights_back`` for one axis: neighbours share their bins, so sums stay in registers."""
+    zero = splat(np.float32(0))
+    a0 = a1 = b0 = b1 = c0 = c1 = zero
+    last_bin = s.bin[axis * pitch + first]
+    for p in range(first, last):
+        own = s.bin[axis * pitch + p]
+        if own != last_bin:
+            add_sums(d_blob, BOTH * last_bin + v, a0, a1, b0, b1, c0, c1)
+            a0 = a1 = b0 = b1 = c0 = c1 = zero
+            last_bin = own
+        g0, g1 = load(s.hidden, BOTH * p + v), load(s.hidden, BOTH * p + v + 8)
+        at = 3 * axis * pitch + p
+        a, b, c = splat(s.coef[at]), splat(s.coef[at + pitch]), splat(s.coef[at + 2 * pitch])
+        a0, a1, b0, b1, c0, c1 = a0 + a * g0, a1 + a * g1, b0 + b * g0, b1 + b * g1, c0 + c * g0, c1 + c * g1
+    add_sums(d_blob, BOTH * last_bin + v, a0, a1, b0, b1, c0, c1)
 
 
 @njit(**INNER)
-def table_back(grid, level, x, d_enc, n, pitch, d_table):
-    """Add one level's rows of the table gradient from a chunk of points: x [3, pitch], d_enc [padded, pitch]."""
-    inverse, one = splat(grid.inverse[level]), splat(np.float32(1))
+def add_sums(target, at, a0, a1, b0, b1, c0, c1):
+    """Add sixteen columns of three rows, BOTH apart."""
+    store(target, at, load(target, at) + a0)
+    store(target, at + 8, load(target, at + 8) + a1)
+    at += BOTH
+    store(target, at, load(target, at) + b0)
+    store(target, at + 8, load(target, at + 8) + b1)
+    at += BOTH
+    store(target, at, load(target, at) + c0)
+    store(target, at + 8, load(target, at + 8) + c1)
+
+
+@njit(**INNER)
+def table_back(grid, level, x, d_enc, n, pitch, rows, parts, d_table):
+    """Add one level's rows of the table gradient from a chunk of points: x [6, pitch], d_enc [padded, pitch].
+
+    Neighbours on a ray often share a cell: their sums stay in registers, one lane per corner, until the cell changes.
+    rows: int32 [3, 64] and parts: float32 [24] are scratch.
+    """
+    zero = splat(np.float32(0))
+    ux, uy, uz = lanes(-1, 1, -1, 1, -1, 1, -1, 1), lanes(-1, -1, 1, 1, -1, -1, 1, 1), lanes(-1, -1, -1, -1, 1, 1, 1, 1)
+    bx, by, bz = lanes(1, 0, 1, 0, 1, 0, 1, 0), lanes(1, 1, 0, 0, 1, 1, 0, 0), lanes(1, 1, 1, 1, 0, 0, 0, 0)
+    last_x, last_y, last_z = isplat(-(2**31)), isplat(-(2**31)), isplat(-(2**31))
+    sum_a, sum_b = zero, zero
+    run, live = 0, False
+    at_a, at_b = 2 * level * pitch, (2 * level + 1) * pitch
     for p in range(0, n, 8):
-        px, py, pz = load(x, p) * inverse, load(x, pitch + p) * inverse, load(x, 2 * pitch + p) * inverse
-        cx, cy, cz = floor(px), floor(py), floor(pz)
-        fx, fy, fz = px - cx, py - cy, pz - cz
-        k = corners(grid.levels, level, to_int(cx), to_int(cy), to_int(cz))
-        a, b = load(d_enc, 2 * level * pitch + p), load(d_enc, (2 * level + 1) * pitch + p)
-        gx, gy, gz = one - fx, one - fy, one - fz
-        corner_pair(d_table, k[0], k[1], gx, fx, gy * gz, a, b)
-        corner_pair(d_table, k[2], k[3], gx, fx, fy * gz, a, b)
-        corner_pair(d_table, k[4], k[5], gx, fx, gy * fz, a, b)
-        corner_pair(d_table, k[6], k[7], gx, fx, fy * fz, a, b)
+        ix, iy, iz, fx, fy, fz = locate(grid, level, x, p, pitch)
+        corners(grid.levels, level, ix, iy, iz, rows)
+        own = 64 + 8 * (p & 8)
+        transpose(rows, 0, 8, rows, own, 8)
+        store(parts, 0, fx)
+        store(parts, 8, fy)
+        store(parts, 16, fz)
+        same = same_bits(slide(last_x, ix), ix) & same_bits(slide(last_y, iy), iy) & same_bits(slide(last_z, iz), iz)
+        last_x, last_y, last_z = ix, iy, iz
+        for i in range(8):
+            if live and not (same >> i) & 1:
+                scatter_add(d_table, rows, run, sum_a, sum_b)
+                live = False
+            a, b = d_enc[at_a + p + i], d_enc[at_b + p + i]
+            if a == 0 and b == 0:
+                continue
+            if not live:
+                live, sum_a, sum_b = True, zero, zero
+            run = own + 8 * i
+            w = (bx + ux * splat(parts[i])) * (by + uy * splat(parts[8 + i])) * (bz + uz * splat(parts[16 + i]))
+            sum_a, sum_b = sum_a + w * splat(a), sum_b + w * splat(b)
+    if live:
+        scatter_add(d_table, rows, run, sum_a, sum_b)

@@ -26,20 +26,20 @@ class Rays(NamedTuple):
 
 
 @njit(**INNER)
-def sample_points(rays, first, count, x, n, pitch):
-    """World positions [3, pitch] of all samples of ``count`` rays."""
+def sample_points(rays, first, count, world, n, pitch):
+    """World positions [3, pitch], in float64, of all samples of ``count`` rays."""
     samples = rays.z.shape[1]
     for i in range(count):
         r = first + i
         pose = rays.c2w[rays.pose[r]]
-        d = rays.direction[r]
+        x, y, z = float(rays.direction[r, 0]), float(rays.direction[r, 1]), float(rays.direction[r, 2])
         for axis in range(3):
-            slope = pose[axis, 0] * d[0] + pose[axis, 1] * d[1] + pose[axis, 2] * d[2]
-            start = pose[axis, 3]
+            slope = pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z
+            start = float(pose[axis, 3])
             for j in range(samples):
-                x[axis * pitch + i * samples + j] = start + slope * rays.z[r, j]
+                world[axis * pitch + i * samples + j] = start + slope * rays.z[r, j]
     for axis in range(3):
-        x[axis * pitch + count * samples : axis * pitch + n] = 0
+        world[axis * pitch + count * samples : axis * pitch + n] = 0
 
 
 @njit(**INNER)

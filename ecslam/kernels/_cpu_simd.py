@@ -183,17 +183,6 @@ def where_positive(typing, a, b):
 
 
 @intrinsic
-def where_equal(typing, a, b, c):
-    """c where a == b, else 0."""
-
-    def generate(context, builder, signature, args):
-        zero = ir.Constant(FLOATS, [0.0] * LANES)
-        return builder.select(builder.fcmp_ordered("==", args[0], args[1]), args[2], zero)
-
-    return f32x8(a, b, c), generate
-
-
-@intrinsic
 def power_of_two(typing, a):
     """2 ** a for whole numbers a in -126..127."""
 
@@ -235,13 +224,15 @@ def row_sums(typing, a, b, c, d, e, f, g, h):
 def transpose(typing, source, at, stride, target, to, pitch):
     """target[to + j * pitch + i] = source[at + i * stride + j] for i, j in 0..7."""
 
+    element = FLOATS if source.dtype == types.float32 else INTS
+
     def generate(context, builder, signature, args):
         kinds = signature.args
         at, stride, to, pitch = (context.cast(builder, args[i], kinds[i], types.intp) for i in (1, 2, 4, 5))
 
         def place(kind, array, start, step, i):
             index = builder.add(start, builder.mul(step, ir.Constant(step.type, i)))
-            return _pointer(context, builder, kind, array, index, FLOATS)
+            return _pointer(context, builder, kind, array, index, element)
 
         rows = [builder.load(place(source, args[0], at, stride, i), align=4) for i in range(LANES)]
         for even, odd, step in STAGES:
@@ -260,20 +251,27 @@ def transpose(typing, source, at, stride, target, to, pitch):
 PAIR = ir.VectorType(FLOAT, 2)
 
 
-def _rows(context, builder, kind, table, index):
-    """Pointers to the eight table rows of two floats."""
+def _row(context, builder, kind, table, index):
+    """Pointer to a table row of two floats."""
     data = context.make_array(kind)(context, builder, table).data
-    base = builder.bitcast(data, PAIR.as_pointer())
-    lanes = [builder.sext(builder.extract_element(index, INT(i)), ir.IntType(64)) for i in range(LANES)]
-    return [builder.gep(base, [lane]) for lane in lanes]
+    return builder.gep(builder.bitcast(data, PAIR.as_pointer()), [builder.sext(index, ir.IntType(64))])
 
 
 @intrinsic
-def gather(typing, table, index):
-    """Both floats of the rows ``index`` of a flat table of rows of two."""
+def gather(typing, table, rows, start):
+    """Both floats of the rows ``rows[start : start + 8]`` of a flat table of rows of two.
+
+    The row numbers come from memory, one load each: cheaper than taking a vector apart, which LLVM would rather do
+    when it sees them being stored, hence the (free) monotonic loads.
+    """
 
     def generate(context, builder, signature, args):
-        pairs = [builder.load(p, align=4) for p in _rows(context, builder, table, *args)]
+        start = context.cast(builder, args[2], signature.args[2], types.intp)
+        pairs = []
+        for i in range(LANES):
+            at = builder.add(start, ir.Constant(start.type, i))
+            index = builder.load_atomic(_pointer(context, builder, rows, args[1], at, INT), "monotonic", 4)
+            pairs.append(builder.load(_row(context, builder, table, args[0], index), align=4))
 
         def join(order):
             halves = [_shuffle(builder, pairs[a], pairs[b], range(4)) for a, b in (order[:2], order[2:])]
@@ -284,21 +282,56 @@ def gather(typing, table, index):
         second = _shuffle(builder, low, high, [1, 3, 9, 11, 5, 7, 13, 15])
         return context.make_tuple(builder, signature.return_type, [first, second])
 
-    return types.UniTuple(f32x8, 2)(table, index), generate
+    return types.UniTuple(f32x8, 2)(table, rows, start), generate
 
 
 @intrinsic
-def scatter_add(typing, table, index, a, b):
-    """Add a and b to the two floats of the rows ``index``, one lane after the other (rows may repeat)."""
+def scatter_add(typing, table, rows, start, a, b):
+    """Add a and b to the two floats of the rows ``rows[start : start + 8]`` of a flat table."""
 
     def generate(context, builder, signature, args):
-        _, index, first, second = args
-        for i, pointer in enumerate(_rows(context, builder, table, args[0], index)):
-            term = _shuffle(builder, first, second, [i, LANES + i])
+        start = context.cast(builder, args[2], signature.args[2], types.intp)
+        for i in range(LANES):
+            at = builder.add(start, ir.Constant(start.type, i))
+            index = builder.load(_pointer(context, builder, rows, args[1], at, INT), align=4)
+            pointer = _row(context, builder, table, args[0], index)
+            term = _shuffle(builder, args[3], args[4], [i, LANES + i])
             builder.store(builder.fadd(builder.load(pointer, align=4), term), pointer, align=4)
         return context.get_dummy_value()
 
-    return types.void(table, index, a, b), generate
+    return types.void(table, rows, start, a, b), generate
+
+
+@intrinsic
+def slide(typing, before, a):
+    """The last lane of ``before``, then the first seven of a."""
+    lanes = range(LANES - 1, 2 * LANES - 1)
+    return a(before, a), lambda context, builder, signature, args: _shuffle(builder, *args, lanes)
+
+
+@intrinsic
+def same_bits(typing, a, b):
+    """Bit i is set where lane i of two integer vectors is equal."""
+
+    def generate(context, builder, signature, args):
+        mask = builder.bitcast(builder.icmp_signed("==", *args), ir.IntType(LANES))
+        return builder.zext(mask, ir.IntType(64))
+
+    return types.int64(a, b), generate
+
+
+@intrinsic
+def lanes(typing, a, b, c, d, e, f, g, h):
+    """The vector of eight given floats."""
+
+    def generate(context, builder, signature, args):
+        values = [context.cast(builder, v, k, types.float32) for v, k in zip(args, signature.args, strict=True)]
+        vector = ir.Constant(FLOATS, ir.Undefined)
+        for i, value in enumerate(values):
+            vector = builder.insert_element(vector, value, INT(i))
+        return vector
+
+    return f32x8(a, b, c, d, e, f, g, h), generate
 
 
 @intrinsic

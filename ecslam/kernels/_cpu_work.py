@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from ._cpu_field import (
+    BLOCK,
     BOTH,
     HALF,
     INNER,
@@ -36,12 +37,12 @@ def up_to_eight(n):
 
 
 @njit(**INNER)
-def load_points(points, first, count, x, n, pitch):
+def load_points(points, first, count, world, n, pitch):
     """Points [N, 3] into a chunk; padding is zero."""
     for axis in range(3):
         for i in range(count):
-            x[axis * pitch + i] = points[first + i, axis]
-        x[axis * pitch + count : axis * pitch + n] = 0
+            world[axis * pitch + i] = points[first + i, axis]
+        world[axis * pitch + count : axis * pitch + n] = 0
 
 
 @njit(**OUTER)
@@ -54,7 +55,7 @@ def values_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sd
             break
         count = min(pitch, points.shape[0] - first)
         n = up_to_eight(count)
-        load_points(points, first, count, s.x, n, pitch)
+        load_points(points, first, count, s.world, n, pitch)
         forward(grid, table, net, s, n, pitch, False)
         sdf[first : first + count] = s.out[:count]
         for i in range(count):
@@ -74,15 +75,15 @@ def slopes(grid, table, net, s, count, pitch, want_light):
             c = s.out[at + p]
             s.up[at + p] = LUMINANCE[k] * c * (1 - c) if want_light else 0
     spare = np.empty(4 * HALF, np.float32)
-    hidden_back(net, s, n, pitch, spare[:HALF], spare[HALF:])
+    hidden_back(net, s, 0, n, pitch, spare[:HALF], spare[HALF:])
 
 
 @njit(**INNER)
 def slope_of(grid, net, s, count, pitch, half):
     """Position gradients of TSDF (half 0) or luminance (half 1) into ``s.d_x``."""
     n = up_to_eight(count)
-    features_back(net, s, n, pitch, half * HALF, (half + 1) * HALF)
-    points_back(grid, net, s, n, pitch, half * HALF, (half + 1) * HALF)
+    features_back(net, s, 0, n, pitch, half * HALF, (half + 1) * HALF)
+    points_back(grid, net, s, 0, n, pitch, half * HALF, (half + 1) * HALF)
 
 
 @njit(**INNER)
@@ -100,7 +101,7 @@ def gradients_worker(t, counter, kept, buffers, pitch, grid, net, table, points,
         if first >= points.shape[0]:
             break
         count = min(pitch, points.shape[0] - first)
-        load_points(points, first, count, s.x, up_to_eight(count), pitch)
+        load_points(points, first, count, s.world, up_to_eight(count), pitch)
         slopes(grid, table, net, s, count, pitch, True)
         for half in range(2):
             target = d_light if half else d_sdf
@@ -130,7 +131,7 @@ def add_rows(sums, residual, kernel, j):
 @njit(**INNER)
 def jacobian(rotated, i, pitch, g, scale, j):
     """Row [6] of the Jacobian of a residual with position gradient ``scale * g``: translation, then rotation."""
-    x, y, z = float(rotated[i]), float(rotated[pitch + i]), float(rotated[2 * pitch + i])
+    x, y, z = rotated[i], rotated[pitch + i], rotated[2 * pitch + i]
     a, b, c = scale * g[i], scale * g[pitch + i], scale * g[2 * pitch + i]
     j[0], j[1], j[2] = a, b, c
     j[3], j[4], j[5] = y * c - z * b, z * a - x * c, x * b - y * a
@@ -141,7 +142,7 @@ def align_worker(t, counter, kept, buffers, pitch, grid, net, table, c2w, points
     """Gauss-Newton sums [chunks, 45]: jtj, jtr, cost, inliers, used."""
     truncation, kernel, limit, low, high, colour, colour_kernel = settings
     s = carve(kept[t], buffers[t], pitch, net.padded)
-    rotated = np.empty(3 * pitch, np.float32)
+    rotated = np.empty(3 * pitch)
     keep = np.empty(pitch, np.bool_)
     j = np.empty(6)
     while True:
@@ -150,12 +151,12 @@ def align_worker(t, counter, kept, buffers, pitch, grid, net, table, c2w, points
         if first >= points.shape[0]:
             break
         count = min(pitch, points.shape[0] - first)
-        load_points(points, first, count, s.x, up_to_eight(count), pitch)
+        load_points(points, first, count, s.world, up_to_eight(count), pitch)
         for i in range(count):
-            x, y, z = s.x[i], s.x[pitch + i], s.x[2 * pitch + i]
+            x, y, z = s.world[i], s.world[pitch + i], s.world[2 * pitch + i]
             for axis in range(3):
                 rotated[axis * pitch + i] = c2w[axis, 0] * x + c2w[axis, 1] * y + c2w[axis, 2] * z
-                s.x[axis * pitch + i] = rotated[axis * pitch + i] + c2w[axis, 3]
+                s.world[axis * pitch + i] = rotated[axis * pitch + i] + c2w[axis, 3]
         slopes(grid, table, net, s, count, pitch, colour > 0)
         slope_of(grid, net, s, count, pitch, 0)
         total = sums[chunk]
@@ -189,7 +190,7 @@ def render_worker(t, counter, kept, buffers, chunk_rays, grid, net, table, beta,
             break
         count = min(chunk_rays, rays.z.shape[0] - first)
         n = up_to_eight(count * samples)
-        sample_points(rays, first, count, s.x, n, pitch)
+        sample_points(rays, first, count, s.world, n, pitch)
         forward(grid, table, net, s, n, pitch, False)
         composite(beta, count, samples, s, n)
         for i in range(count):
@@ -242,19 +243,28 @@ def step_worker(
             first = chunk * chunk_rays
             count = min(chunk_rays, total - first)
             n = up_to_eight(count * samples)
-            sample_points(rays, first, count, s.x, n, pitch)
+            sample_points(rays, first, count, s.world, n, pitch)
             forward(grid, table, net, s, n, pitch, want_poses)
             composite(beta, count, samples, s, n)
             d_beta = compare(rays, first, count, beta, w, counts, s, n, pitch, losses[group])
+            own[b + 4 * HALF] += d_beta
             if want_params or want_poses:
-                own[b + 4 * HALF] += d_beta
-                hidden_back(net, s, n, pitch, own[b : b + HALF], own[b + HALF : b + 4 * HALF])
-                features_back(net, s, n, pitch, 0, BOTH)
-            if want_params:
-                weights_back(grid, net, s, n, pitch, own[:a], own[a:b])
+                backward(grid, net, s, n, pitch, want_params, want_poses, own, a, b)
             if want_poses:
-                points_back(grid, net, s, n, pitch, 0, BOTH)
                 pose_sums(rays.z, first, count, s, pitch, sums)
+
+
+@njit(**INNER)
+def backward(grid, net, s, n, pitch, want_params, want_poses, own, a, b):
+    """From ``s.up`` to gradients of positions, features and decoders (``own``: features to a, blob to b, the rest)."""
+    for first in range(0, n, BLOCK):
+        last = min(first + BLOCK, n)
+        hidden_back(net, s, first, last, pitch, own[b : b + HALF], own[b + HALF : b + 4 * HALF])
+        features_back(net, s, first, last, pitch, 0, BOTH)
+        if want_params:
+            weights_back(grid, net, s, first, last, pitch, own[:a], own[a:b])
+        if want_poses:
+            points_back(grid, net, s, first, last, pitch, 0, BOTH)
 
 
 @njit(**OUTER)
@@ -263,19 +273,20 @@ def table_worker(t, counter, kept, chunk_rays, grid, padded, total, samples, d_t
     pitch = up_to_eight(chunk_rays * samples)
     chunks = (total + chunk_rays - 1) // chunk_rays
     levels = grid.levels.shape[0]
+    rows, parts = np.empty(192, np.int32), np.empty(24, np.float32)
     while True:
         level = levels - 1 - fetch_add(counter, 0)
         if level < 0:
             break
-        first, rows = grid.levels[level, OFFSET], grid.levels[level, MASK] + 1
-        d_table[2 * first : 2 * (first + rows)] = 0
+        start = 2 * grid.levels[level, OFFSET]
+        d_table[start : start + 2 * grid.levels[level, MASK] + 2] = 0
         for chunk in range(chunks):
             n = up_to_eight(min(chunk_rays, total - chunk * chunk_rays) * samples)
-            table_back(grid, level, kept[chunk, : 3 * pitch], kept[chunk, 3 * pitch :], n, pitch, d_table)
+            table_back(grid, level, kept[chunk, : 6 * pitch], kept[chunk, 6 * pitch :], n, pitch, rows, parts, d_table)
 
 
 @njit(**OUTER)
-def fill_net(w_in, w_sdf, w_rgb, features, bins, padded, flat, flat_t, blob, sdf, rgb):
+def fill_net(w_in, w_sdf, w_rgb, features, bins, padded, flat, flat_t, blob, steps, sdf, rgb):
     """Lay the decoders out as ``Net`` wants them."""
     flat[features * BOTH :] = 0
     for i in range(features):
@@ -289,6 +300,8 @@ def fill_net(w_in, w_sdf, w_rgb, features, bins, padded, flat, flat_t, blob, sdf
             source = features + axis * bins + (i - 1) % bins
             at = (axis * (bins + 2) + i) * BOTH
             blob[at : at + BOTH] = w_in[source]
+    for at in range(blob.shape[0] - BOTH):
+        steps[at] = blob[at + BOTH] - blob[at]
     for j in range(HALF):
         sdf[j] = w_sdf[j, 0]
         for k in range(3):
