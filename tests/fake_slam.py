@@ -78,13 +78,15 @@ class FakeField:
 
 @dataclass
 class Behaviour:
-    """What a ``FakeSlam`` does. mapping: interrupts x seconds in the first frame; later ones map every 5th frame."""
+    """What a ``FakeSlam`` does: how often it calls ``interrupt`` in the first frame and in later ones, each after a
+    pause; where a loop closes, it is lost, it fails, and it has no depth to start with."""
 
     first_interrupts: int = 0
     interrupts: int = 1
     pause_s: float = 0.0
     loop_at: int = -1
     lost: tuple[int, ...] = ()
+    empty: tuple[int, ...] = ()
     fail_at: int = -1
     noise_cm: float = 1.0
 
@@ -102,6 +104,8 @@ class FakeSlam:
         b, first = self.behaviour, self.field is None
         if frame.index == b.fail_at:
             raise RuntimeError("the map exploded")
+        if frame.index in b.empty:
+            raise FrameError(f"frame {frame.index}: no usable depth")
         before = np.eye(4) if frame.c2w_gt is None else frame.c2w_gt.copy()
         wobble = np.sin(np.arange(3) + frame.index)
         before[:3, 3] += 0.02 * b.noise_cm * wobble
@@ -158,6 +162,7 @@ def maker(behaviour: Behaviour | None = None):
 
     def make(config, intrinsics, *, device, bounds, first_pose, state):
         slam = FakeSlam(config, behaviour or Behaviour())
+        slam.first_pose = first_pose
         if state is not None:
             slam.trajectory = FakeTrajectory(state["poses"], state["timestamps"])
             slam.field = FakeField()

@@ -105,6 +105,13 @@ def test_over_a_fifth_of_unreadable_frames_ends_the_run_and_keeps_what_there_is(
     assert summary["skipped_frames"] == 6
 
 
+def test_the_world_is_that_of_the_first_frame_the_engine_can_use(tmp_path):
+    make = maker(Behaviour(empty=(0, 1)))
+    summary = run(tmp_path, FakeSequence(12), make=make)
+    assert (summary["frames"], summary["skipped_frames"], summary["unreadable_frames"]) == (10, 2, [])
+    assert np.array_equal(make.made[-1].first_pose, circle(12)[2])
+
+
 def test_a_sequence_without_a_usable_frame_is_an_error(tmp_path):
     with pytest.raises(InputError, match=r"fake: none of 4 frames could be used.*000000.png"):
         run(tmp_path, FakeSequence(4, bad=(0, 1, 2, 3)))

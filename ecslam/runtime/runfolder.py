@@ -128,9 +128,11 @@ class RunFolder:
     def keyframe(self, frame: int, c2w: NDArray[np.float64], thumbnail: NDArray[np.uint8]) -> None:
         """Log a keyframe and save its picture, uint8 [h, w, 3] RGB."""
         name = f"thumbnails/{frame:06d}.jpg"
-        done, jpeg = cv2.imencode(".jpg", thumbnail[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
-        if done:
-            self.write(name, jpeg.tobytes())
+        _, jpeg = cv2.imencode(".jpg", thumbnail[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+        try:
+            (self.path / name).write_bytes(jpeg.tobytes())
+        except OSError as error:
+            self.missing(name, error)
         self._append("keyframes.jsonl", {"frame": frame, "c2w": c2w[:3].reshape(-1), "thumbnail": name})
 
     def thumbnails(self) -> dict[int, NDArray[np.uint8]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
 
@@ -68,8 +68,8 @@ class Tally:
         return rows.clip(0)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
+        """Plain values, copied."""
+        return {k: list(v) if isinstance(v, list) else v for k, v in vars(self).items()}
 
 
 class Stopwatch:
