@@ -1,0 +1,94 @@
+"""The README's pictures, made from real runs: ``python -m ecslam_app.shots RUN [OTHER_RUN] --out assets``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ecslam.messages import RunTo
+from ecslam.types import InputError
+
+from .browser import dismiss_toasts, launch
+from .server import Dashboard, view
+
+DESKTOP, PHONE = (1440, 860), (390, 780)
+SETTLE_MS = 2500
+
+
+def take(runs: list[Path], out: Path) -> list[Path]:
+    """Write the pictures light, dark, phone, loops and (with two runs) compare into ``out``. Raises InputError."""
+    out.mkdir(parents=True, exist_ok=True)
+    made = []
+    with launch() as browser:
+        for name, size, dark, some, act in _pictures(runs):
+            dashboard = view(some, port=0, dark=dark)
+            try:
+                made.append(_take_one(browser, dashboard, size, act, out / f"dashboard_{name}.png"))
+            finally:
+                dashboard.close()
+    return made
+
+
+def _pictures(
+    runs: list[Path],
+) -> list[tuple[str, tuple[int, int], bool, list[Path], Callable[[Any, Dashboard], None]]]:
+    first = runs[:1]
+    pictures = [
+        ("light", DESKTOP, False, first, _show_plots),
+        ("dark", DESKTOP, True, first, _show_plots),
+        ("phone", PHONE, False, first, _show_nothing),
+        ("loops", DESKTOP, False, first, _show_loop),
+    ]
+    return pictures + ([("compare", DESKTOP, True, runs, _show_nothing)] if len(runs) == 2 else [])
+
+
+def _take_one(
+    browser: Any, dashboard: Dashboard, size: tuple[int, int], act: Callable[[Any, Dashboard], None], path: Path
+) -> Path:
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]}, device_scale_factor=1.5)
+    page.goto(dashboard.url)
+    page.locator(".ec-row b").wait_for()
+    page.wait_for_timeout(SETTLE_MS)
+    act(page, dashboard)
+    dismiss_toasts(page)
+    page.wait_for_timeout(SETTLE_MS)
+    page.screenshot(path=str(path))
+    page.close()
+    return path
+
+
+def _show_nothing(page: Any, dashboard: Dashboard) -> None:
+    """The page as it opens."""
+
+
+def _show_plots(page: Any, dashboard: Dashboard) -> None:
+    current = dashboard.hub.current
+    dashboard.engine.submit(RunTo(0 if current is None else int(0.8 * current.frames_total)))
+    page.get_by_role("tab", name="Plots").click()
+
+
+def _show_loop(page: Any, dashboard: Dashboard) -> None:
+    page.get_by_role("tab", name="Loops").click()
+    page.get_by_role("button", name="Next event").click()
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="one run folder, or two to compare")
+    parser.add_argument("--out", type=Path, default=Path("assets"), help="where the pictures go")
+    arguments = parser.parse_args()
+    try:
+        for path in take(arguments.runs, arguments.out):
+            print(path)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

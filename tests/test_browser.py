@@ -1,0 +1,272 @@
+"""What a user does, in a real browser: watch a run, steer it, take it away, look at it again."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+from ecslam_app import server
+from ecslam_app.browser import dismiss_toasts, install_chromium, launch
+from PIL import Image
+
+from ecslam import messages as m
+from tests.fake_engine import FakeEngine, write_run
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+WAIT_MS = 20_000
+
+
+@pytest.fixture(scope="session")
+def browser():
+    pytest.importorskip("playwright", reason="browser tests need: pip install playwright")
+    path = install_chromium()
+    if path is None:
+        warnings.warn("BROWSER TESTS SKIPPED: no Chromium here, and apt may not install it", stacklevel=1)
+        pytest.skip("no Chromium here, and apt may not install it")
+    with launch(path) as chromium:
+        yield chromium
+
+
+class Visit:
+    """One tab on a dashboard, with what its console complained about."""
+
+    def __init__(self, browser, dashboard, width=1280, height=760):
+        self.errors, self.dashboard = [], dashboard
+        self.page = browser.new_page(viewport={"width": width, "height": height})
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)
+        self.page.goto(dashboard.url)
+        self.page.locator(".ec-row b").wait_for(timeout=WAIT_MS)
+        self.wait(lambda: dashboard.hub.scene.mesh is not None)
+        self.page.wait_for_timeout(1500)
+        dismiss_toasts(self.page)
+
+    @property
+    def frame(self):
+        return int(self.page.locator(".ec-row b").inner_text())
+
+    @property
+    def camera(self):
+        return np.array(next(iter(self.dashboard.hub.viewers())).camera.position)
+
+    def press(self, name):
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def tab(self, name):
+        self.page.get_by_role("tab", name=name).click()
+
+    def tick(self, label):
+        self.page.get_by_label(label, exact=True).click()
+
+    def state(self, text):
+        self.wait(lambda: self.page.locator(".ec-chip", has_text=text).count() == 1)
+
+    def wait(self, condition, seconds=20):
+        for _ in range(seconds * 20):
+            if condition():
+                return
+            self.page.wait_for_timeout(50)
+        shown, current = self.page.locator(".ec").first.inner_text(), self.dashboard.hub.current.state
+        raise AssertionError(f"waited in vain; the page says {shown!r}, the engine {current}")
+
+    def download(self, button):
+        with self.page.expect_download(timeout=60_000) as download:
+            self.press(button)
+        return download.value
+
+    def pixels(self):
+        """The scene without the panel at the right, float [h, w, 3]."""
+        self.page.wait_for_timeout(700)
+        picture = Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")
+        return np.asarray(picture, float)[:, : picture.width - 380]
+
+
+def hue_count(pixels, hue_deg, spread=14):
+    """How many clearly coloured pixels have about this hue."""
+    hsv = np.asarray(Image.fromarray(pixels.astype(np.uint8)).convert("HSV"), float)
+    away = np.abs((hsv[..., 0] * 360 / 255 - hue_deg + 180) % 360 - 180)
+    return int(((away < spread) & (hsv[..., 1] > 110) & (hsv[..., 2] > 110)).sum())
+
+
+@pytest.fixture
+def live(tmp_path, browser):
+    engine = FakeEngine(tmp_path / "run", frames=400, period=0.1).start()
+    dashboard = server.start(engine, port=0)
+    visit = Visit(browser, dashboard)
+    yield engine, visit
+    visit.page.close()
+    dashboard.close()
+    engine.stop()
+    assert visit.errors == []
+
+
+def test_scene_shows_mesh_trajectories_and_frusta(live):
+    engine, visit = live
+    engine.submit(m.RunTo(150))
+    visit.wait(lambda: engine.latest().frame >= 150)
+    visit.tab("View")
+    full = visit.pixels()
+    visit.press("Off")
+    bare = visit.pixels()
+    assert (np.abs(full - bare).max(-1) > 25).mean() > 0.1, "the mesh covers a good part of the view"
+    assert hue_count(bare, 25) > 300, "the estimate is orange"
+    assert hue_count(bare, 217) > 300, "the ground truth is blue"
+    assert hue_count(bare, 292) > 60, "the window is magenta"
+    visit.tick("Ground truth")
+    assert hue_count(visit.pixels(), 217) < 0.2 * hue_count(bare, 217)
+    visit.tick("Keyframes")
+    assert hue_count(visit.pixels(), 292) < 0.2 * hue_count(bare, 292)
+    visit.press("Wireframe")
+    assert (np.abs(visit.pixels() - bare).max(-1) > 25).mean() > 0.02
+
+
+def test_pause_step_resume_and_hot_keys(live):
+    _, visit = live
+    visit.press("Pause")
+    visit.state("Paused")
+    before = visit.frame
+    visit.page.wait_for_timeout(800)
+    assert visit.frame == before
+    visit.press("Step")
+    visit.wait(lambda: visit.frame == before + 1)
+    visit.page.wait_for_timeout(500)
+    assert visit.frame == before + 1
+    visit.page.mouse.click(300, 300)
+    visit.page.keyboard.press("n")
+    visit.wait(lambda: visit.frame == before + 2)
+    visit.page.keyboard.press("Space")
+    visit.wait(lambda: visit.frame > before + 4)
+    visit.press("Pause")
+    visit.state("Paused")
+
+
+def test_switch_preset_and_start_over(live):
+    engine, visit = live
+    visit.wait(lambda: visit.frame > 20)
+    visit.page.get_by_label("Preset", exact=True).first.click()
+    visit.page.get_by_role("option", name="full", exact=True).click()
+    visit.press("Restart")
+    visit.wait(lambda: m.Restart("synthetic/studio", "full", 0, "strict") in engine.log)
+    visit.page.locator(".ec-name", has_text="full").wait_for(timeout=WAIT_MS)
+    assert engine.latest().preset == "full"
+
+
+def test_exports_arrive_in_the_browser(live, tmp_path):
+    engine, visit = live
+    visit.press("Pause")
+    visit.state("Paused")
+    visit.tab("Export")
+    visit.download("Export mesh").save_as(tmp_path / "mesh.ply")
+    mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    assert len(mesh.faces) > 1000
+    assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
+    visit.page.get_by_text(str(engine.run_folder)).first.wait_for(timeout=WAIT_MS)
+    visit.download("Export trajectory").save_as(tmp_path / "poses.txt")
+    assert len((tmp_path / "poses.txt").read_text().splitlines()) == visit.frame
+    visit.download("Save screenshot").save_as(tmp_path / "shot.png")
+    assert np.asarray(Image.open(tmp_path / "shot.png")).std() > 10
+    assert list((engine.run_folder / "exports").glob("screenshot_*.png"))
+
+
+def test_html_replay_plays_by_itself(live, browser, tmp_path):
+    _, visit = live
+    visit.press("Pause")
+    visit.state("Paused")
+    visit.tab("Export")
+    visit.download("Save HTML replay").save_as(tmp_path / "replay.html")
+    page, errors = browser.new_page(viewport={"width": 900, "height": 600}), []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(f"file://{tmp_path / 'replay.html'}")
+    page.wait_for_timeout(4000)
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)
+    page.close()
+    assert hue_count(picture, 25) > 100
+    assert errors == []
+
+
+def test_click_on_a_keyframe_flies_there(live):
+    engine, visit = live
+    visit.wait(lambda: visit.frame > 60)
+    visit.press("Pause")
+    visit.state("Paused")
+    visit.tab("Pictures")
+    visit.page.wait_for_timeout(800)
+    client = next(iter(visit.dashboard.hub.viewers()))
+    before, box = visit.camera, visit.page.locator("canvas").first.bounding_box()
+    rotation = np.linalg.inv(_rotation(client.camera.wxyz))
+    for keyframe in engine.latest().keyframes[3:8]:
+        middle = keyframe.c2w[:3, 3] + 0.09 * keyframe.c2w[:3, 2]
+        x, y, z = rotation @ (middle - client.camera.position)
+        focal = box["height"] / 2 / np.tan(client.camera.fov / 2)
+        visit.page.mouse.click(
+            box["x"] + box["width"] / 2 + focal * x / z, box["y"] + box["height"] / 2 + focal * y / z
+        )
+        visit.page.wait_for_timeout(1200)
+        if np.linalg.norm(visit.camera - before) > 0.5:
+            break
+    assert np.linalg.norm(visit.camera - before) > 0.5
+    assert visit.page.get_by_text(re.compile(r"^Keyframe \d+$")).count() == 1
+
+
+def _rotation(wxyz):
+    import viser.transforms as vt
+
+    return vt.SO3(np.asarray(wxyz)).as_matrix()
+
+
+def test_finished_run_is_scrubbed_and_its_loop_inspected(browser, tmp_path):
+    dashboard = server.view([write_run(tmp_path / "lite", 60), write_run(tmp_path / "full", 60, drift=0.3)], port=0)
+    visit = Visit(browser, dashboard)
+    try:
+        assert visit.frame == 60
+        assert visit.page.get_by_text("ATE RMSE, cm").count() == 1
+        slider = visit.page.get_by_role("slider").first
+        slider.focus()
+        for _ in range(12):
+            visit.page.keyboard.press("ArrowLeft")
+        visit.wait(lambda: visit.frame == 48)
+        visit.press("Play")
+        visit.wait(lambda: visit.frame == 60)
+        before = visit.camera
+        visit.tab("Loops")
+        visit.press("Next event")
+        visit.page.get_by_text("met keyframes").wait_for(timeout=WAIT_MS)
+        visit.page.wait_for_timeout(1500)
+        assert np.linalg.norm(visit.camera - before) > 0.3
+        assert hue_count(visit.pixels(), 160) > 20, "the links are green"
+    finally:
+        visit.page.close()
+        dashboard.close()
+    assert visit.errors == []
+
+
+def test_page_survives_a_lost_connection(live):
+    _, visit = live
+    visit.dashboard.hub.server._websock_server.disconnect_all_clients()
+    before = visit.frame
+    visit.wait(lambda: visit.frame > before + 3)
+    visit.errors.clear()  # the browser itself reports the lost socket
+
+
+def test_usable_on_a_phone(tmp_path, browser):
+    engine = FakeEngine(tmp_path / "run", frames=100, period=0.03).start()
+    dashboard = server.start(engine, port=0, dark=True)
+    visit = Visit(browser, dashboard, 390, 780)
+    try:
+        wide = visit.page.evaluate("document.documentElement.scrollWidth")
+        card = visit.page.locator(".ec").first.bounding_box()
+        assert wide <= 390
+        assert card["x"] >= 0
+        assert card["x"] + card["width"] <= 390
+        assert card["width"] > 340
+        visit.press("Pause")
+        visit.state("Paused")
+    finally:
+        visit.page.close()
+        dashboard.close()
+        engine.stop()
+    assert visit.errors == []
