@@ -43,11 +43,11 @@ class LoopDetector:
     """Turns revisits into events: one when a revisit begins, none while it lasts."""
 
     def __init__(self, rule: RevisitRule = RevisitRule()) -> None:
-        self._rule, self._inside = rule, False
+        self._rule, self.inside = rule, False
 
     def update(self, keyframes: NDArray[np.float64], current: NDArray[np.float64]) -> NDArray[np.int64]:
         """The old keyframes of a revisit that begins now; empty otherwise."""
         old = revisited(keyframes, current, self._rule)
-        begins = len(old) > 0 and not self._inside
-        self._inside = len(old) > 0
+        begins = len(old) > 0 and not self.inside
+        self.inside = len(old) > 0
         return old if begins else old[:0]

@@ -8,15 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from .config import Config
 from .field import TsdfField, grow_field, map_params, regrow
-from .kernels import LOSS_NAMES, Backend
-from .losses import smoothness_gradient
+from .kernels import LOSS_NAMES, Backend, FieldParams
+from .losses import smooth_lattice, smoothness
 from .pixels import Pixels
 from .pose_adam import PoseAdam
 from .rays import gather, kernel_weights, make_rays
 from .samples import resample_missing
+from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 
 BETAS = (0.9, 0.99)
 EPSILON = 1e-15
@@ -33,6 +35,10 @@ class MapResult:
     loss_first: float
 
 
+def _tensors(params: FieldParams) -> list[Tensor]:
+    return [params.table, params.w_in, params.w_sdf, params.w_rgb, params.beta]
+
+
 class Mapper:
     """Owns the field and its Adam state; the only writer of both."""
 
@@ -44,14 +50,13 @@ class Mapper:
         self._optimiser = self._make_optimiser(config)
 
     def _make_optimiser(self, config: Config) -> torch.optim.Adam:
-        p, g = self.field.params, self._gradients
-        pairs = [(p.table, g.table), (p.w_in, g.w_in), (p.w_sdf, g.w_sdf), (p.w_rgb, g.w_rgb), (p.beta, g.beta)]
-        for tensor, gradient in pairs:
+        tensors = _tensors(self.field.params)
+        for tensor, gradient in zip(tensors, _tensors(self._gradients), strict=True):
             tensor.grad = gradient
         m = config.mapping
         groups = [
-            {"params": [p.table], "lr": m.lr_grid},
-            {"params": [tensor for tensor, _ in pairs[1:]], "lr": m.lr_decoder},
+            {"params": tensors[:1], "lr": m.lr_grid},
+            {"params": tensors[1:], "lr": m.lr_decoder},
         ]
         return torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True)
 
@@ -84,7 +89,8 @@ class Mapper:
                 field.layout, field.params, poses.c2w.float(), rays, weights, self._gradients, move
             )
             if smooth and m.smooth_weight > 0:
-                self._gradients.table.add_(smoothness_gradient(field, m, self._generator))
+                _, gradient = smoothness(field, smooth_lattice(field, m, self._generator))
+                self._gradients.table.add_(gradient, alpha=m.smooth_weight)
             self._optimiser.step()
             field.params.beta.clamp_(min=MIN_BETA)
             if result.d_c2w is not None:
@@ -93,6 +99,36 @@ class Mapper:
             first = last if iteration == 0 else first
         losses = dict(zip(LOSS_NAMES, last.tolist(), strict=True))
         return MapResult(poses.c2w.cpu().numpy(), losses, float(first.sum()))
+
+    def state(self) -> Arrays:
+        """The field, the optimiser's moments and the random states, as copies."""
+        moments = {
+            f"moment{i}.{name}": torch.as_tensor(value).cpu().numpy().copy()
+            for i, values in self._optimiser.state_dict()["state"].items()
+            for name, value in values.items()
+        }
+        return {
+            **prefixed("field", pack_field(self.field)),
+            **prefixed("random", pack_random(self._rng, self._generator)),
+            **moments,
+        }
+
+    @classmethod
+    def restore(cls, state: Arrays, kernels: Backend, config: Config, device: torch.device) -> Mapper:
+        """The inverse of ``state``."""
+        self = cls(unpack_field(part("field", state), device), kernels, config, 0)
+        unpack_random(part("random", state), self._rng, self._generator)
+        moments: dict[int, dict[str, Tensor]] = {}
+        for i in range(len(_tensors(self.field.params))):
+            found = part(f"moment{i}", state)
+            if found:
+                moments[i] = {name: torch.from_numpy(value.copy()) for name, value in found.items()}
+        self._load_moments(moments)
+        return self
+
+    def _load_moments(self, moments: dict[int, dict[str, Tensor]]) -> None:
+        groups = self._optimiser.state_dict()["param_groups"]
+        self._optimiser.load_state_dict({"state": moments, "param_groups": groups})
 
     def _pick(self, views: Sequence[Pixels], rays: int) -> list[NDArray[np.int64]]:
         """An equal share of the rays for every view."""
@@ -110,6 +146,4 @@ class Mapper:
             i: {k: regrow(old.layout, self.field.layout, v) if v.shape == table else v for k, v in state.items()}
             for i, state in moments.items()
         }
-        self._optimiser.load_state_dict(
-            {"state": carried, "param_groups": self._optimiser.state_dict()["param_groups"]}
-        )
+        self._load_moments(carried)

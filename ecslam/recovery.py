@@ -24,7 +24,7 @@ class Recovery:
 
     def __init__(self) -> None:
         self.lost, self.missed, self.note = False, False, ""
-        self._misses = 0
+        self.misses = 0
 
     def judge(
         self, track: TrackResult, last: NDArray[np.float64], relocalise: Callable[[], TrackResult | None]
@@ -38,11 +38,11 @@ class Recovery:
                 self.note = "relocalised" if self.lost else "recovered"
                 track, trusted = found, True
         if trusted:
-            self.lost, self.missed, self._misses = False, False, 0
+            self.lost, self.missed, self.misses = False, False, 0
             return track
-        self._misses += 1
+        self.misses += 1
         self.missed = True
-        self.lost = self.lost or self._misses >= PATIENCE
+        self.lost = self.lost or self.misses >= PATIENCE
         self.note = "lost: the map does not explain this frame" if self.lost else "not tracked, pose held"
         return replace(track, c2w=last)
 

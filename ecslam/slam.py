@@ -24,20 +24,17 @@ from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
 from .pixels import Pixels, choose_pixels
 from .recovery import Recovery, best_start
+from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .se3 import rotation_angle_deg
 from .tracker import TrackResult, track_adam, track_direct
 from .trajectory import Trajectory
-from .types import Frame, Intrinsics
+from .types import Frame, FrameError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
 from .window import random_window, select_window
 
 Interrupt = Callable[[], None]
 RELOCALISE_FROM = 5
 RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
-
-
-class Interrupted(Exception):
-    """Raised by an ``interrupt`` callback to abandon a step."""
 
 
 class Slam:
@@ -109,18 +106,19 @@ class Slam:
         started = time.perf_counter()
         keyframe = self._make_keyframe(frame)
         if len(keyframe.pixels.points()) == 0:
-            raise ValueError("the first frame has no usable depth")
+            raise FrameError(f"frame {frame.index}: no usable depth, so the map cannot start here")
         box = self._bounds
         if box is None:
             box = box_of_points(_world(keyframe.pixels, self._first_pose), self.config.field.box_margin_m)
         field = create_field(self.config.field, box, self.config.seed, self.device)
         self.mapper = Mapper(field, self._kernels, self.config, self.config.seed)
+        self._frozen = field
         self.trajectory.append(self._first_pose, frame.timestamp, True, keyframe=True)
         self.keyframes.append(keyframe)
         try:
             result = self._optimise(np.array([0]), self.config.mapping.first_iterations, interrupt)
         except BaseException:
-            self.mapper = None
+            self.mapper = self._frozen = None
             self.trajectory, self.keyframes = Trajectory(), []
             raise
         self._frozen = self._tracking_field()
@@ -259,6 +257,11 @@ class Slam:
         parts = [_world(k.pixels, pose) for k, pose in zip(self.keyframes, poses, strict=True)]
         return np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
 
+    @property
+    def field(self) -> TsdfField | None:
+        """The map, or None before the first frame's mapping has begun."""
+        return self.mapper.field if self.mapper else None
+
     def query(self) -> tuple[SdfQuery, ColorQuery]:
         """Callables over a frozen copy of the map, safe to use from another thread."""
         return queries(self._require_field().freeze(), self._kernels)
@@ -274,6 +277,36 @@ class Slam:
         """Change tracking and mapping settings from the next frame on; the field keeps its shape."""
         self._apply_pending(block=True)
         self.config = replace(config, field=self.config.field, schedule=self.config.schedule, seed=self.config.seed)
+
+    def state(self) -> Arrays:
+        """Everything that ``restore`` needs, as arrays nobody writes to afterwards."""
+        self._apply_pending(block=True)
+        assert self.mapper is not None
+        return {
+            **prefixed("trajectory", self.trajectory.state()),
+            **prefixed("keyframes", pack_keyframes(self.keyframes)),
+            **prefixed("mapper", self.mapper.state()),
+            **prefixed("random", pack_random(self._rng, self._generator)),
+            "bounds": np.zeros((0, 3)) if self._bounds is None else self._bounds,
+            "inside_loop": np.array(self._loops.inside),
+            "lost": np.array([self._recovery.lost, self._recovery.misses]),
+        }
+
+    @classmethod
+    def restore(
+        cls, config: Config, intrinsics: Intrinsics, state: Arrays, *, device: torch.device | None = None
+    ) -> Slam:
+        """An engine that goes on where ``state`` was taken."""
+        bounds = state["bounds"] if len(state["bounds"]) else None
+        self = cls(config, intrinsics, device=device, bounds=bounds)
+        self.trajectory = Trajectory.restore(part("trajectory", state))
+        self.keyframes = unpack_keyframes(part("keyframes", state))
+        self.mapper = Mapper.restore(part("mapper", state), self._kernels, config, self.device)
+        self._frozen = self._tracking_field()
+        unpack_random(part("random", state), self._rng, self._generator)
+        self._loops.inside = bool(state["inside_loop"])
+        self._recovery.lost, self._recovery.misses = bool(state["lost"][0]), int(state["lost"][1])
+        return self
 
     def _require_field(self) -> TsdfField:
         assert self._frozen is not None
