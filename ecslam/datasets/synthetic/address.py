@@ -1,0 +1,72 @@
+"""Addresses of the built-in rooms, e.g. ``synthetic/studio?noise=1&frames=300&size=1200x680``."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, replace
+from urllib.parse import parse_qsl
+
+from ...types import InputError
+
+ROOMS = ("studio", "apartment", "corridor")
+PREFIX = "synthetic/"
+MAX_SIDE, MAX_FRAMES = 4096, 100_000
+
+
+@dataclass(frozen=True)
+class Address:
+    """Which room to render and how. frames: None for one round of the room's path. width, height: pixels."""
+
+    room: str
+    width: int = 640
+    height: int = 480
+    frames: int | None = None
+    noise: bool = False
+    seed: int = 0
+
+
+def parse_address(address: str, defaults: Address | None = None) -> Address:
+    """Read a room's name, with or without ``synthetic/`` and with options after ``?`` that override ``defaults``.
+
+    Options: noise=0|1, frames=N, size=WxH, seed=N. Raises InputError for an unknown room, an unknown option or a value
+    out of range.
+    """
+    name, _, query = address.removeprefix(PREFIX).partition("?")
+    if name not in ROOMS:
+        near = difflib.get_close_matches(name, ROOMS, 1, 0.4)
+        hint = f"did you mean {PREFIX}{near[0]}?" if near else f"choose from {', '.join(PREFIX + r for r in ROOMS)}"
+        raise InputError(f"{PREFIX}{name}: no such built-in room; {hint}")
+    out = replace(defaults or Address(name), room=name)
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        out = _apply(out, key, value, address)
+    return check(out)
+
+
+def check(address: Address) -> Address:
+    """The address itself. Raises InputError where image size, number of frames or seed cannot be used."""
+    where = PREFIX + address.room
+    if not (16 <= address.width <= MAX_SIDE and 16 <= address.height <= MAX_SIDE):
+        raise InputError(
+            f"{where}: size {address.width}x{address.height} is out of range; use 16 to {MAX_SIDE} pixels a side"
+        )
+    if address.frames is not None and not 1 <= address.frames <= MAX_FRAMES:
+        raise InputError(f"{where}: frames={address.frames} is out of range; use 1 to {MAX_FRAMES}")
+    if address.seed < 0:
+        raise InputError(f"{where}: seed={address.seed} is negative; use 0 or more")
+    return address
+
+
+def _apply(address: Address, key: str, value: str, source: str) -> Address:
+    try:
+        if key == "noise":
+            return replace(address, noise={"0": False, "1": True}[value])
+        if key == "frames":
+            return replace(address, frames=int(value))
+        if key == "seed":
+            return replace(address, seed=int(value))
+        if key == "size":
+            width, height = value.split("x")
+            return replace(address, width=int(width), height=int(height))
+    except (ValueError, KeyError):
+        raise InputError(f"{source}: cannot read {key}={value}; write noise=0|1, frames=N, size=WxH, seed=N") from None
+    raise InputError(f"{source}: unknown option {key!r}; the options are noise, frames, size and seed")

@@ -1,0 +1,77 @@
+"""Write a sequence to disk in NICE-SLAM's Replica layout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...types import InputError, Mesh, Sequence
+
+DEPTH_SCALE = 6553.5
+JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+
+
+def write_replica(sequence: Sequence, folder: str | Path, progress: Callable[[int, int], None] | None = None) -> Path:
+    """Write results/frameNNNNNN.jpg and depthNNNNNN.png, traj.txt, cam_params.json and mesh.ply; return the folder.
+
+    ``progress`` is called with (frames done, frames in all). Raises InputError when the folder holds something already
+    or cannot be written, or when the sequence has no poses.
+    """
+    folder = Path(folder)
+    poses = sequence.poses_gt()
+    if poses is None:
+        raise InputError(f"{sequence.name}: has no poses to write; choose a sequence with ground truth")
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            raise InputError(f"{folder}: not empty; choose a new folder")
+        (folder / "results").mkdir(parents=True, exist_ok=True)
+        (folder / "cam_params.json").write_text(_camera(sequence))
+        np.savetxt(folder / "traj.txt", poses.reshape(-1, 16), "%.12f")
+        mesh = sequence.reference_mesh()
+        if mesh is not None:
+            write_ply(mesh, folder / "mesh.ply")
+        for i, frame in enumerate(sequence):
+            _save(folder / "results" / f"frame{i:06d}.jpg", frame.color[..., ::-1], JPEG)
+            depth = np.clip(np.rint(frame.depth.astype(np.float64) * DEPTH_SCALE), 0, 65535)
+            _save(folder / "results" / f"depth{i:06d}.png", depth.astype(np.uint16), [])
+            if progress is not None:
+                progress(i + 1, len(sequence))
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from None
+    return folder
+
+
+def write_ply(mesh: Mesh, path: Path) -> None:
+    """Write a mesh as binary PLY with vertex colours where it has them. Raises OSError."""
+    fields = [("position", "<f4", 3)]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    if mesh.colors is not None:
+        fields.append(("color", "u1", 3))
+        header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    vertices = np.empty(len(mesh.vertices), fields)
+    vertices["position"] = mesh.vertices
+    if mesh.colors is not None:
+        vertices["color"] = mesh.colors
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.faces
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
+    path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
+
+
+def _camera(sequence: Sequence) -> str:
+    k = sequence.intrinsics
+    values = {"w": k.width, "h": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "scale": DEPTH_SCALE}
+    return json.dumps({"camera": values}, indent=2)
+
+
+def _save(path: Path, image: NDArray[np.generic], options: list[int]) -> None:
+    ok, data = cv2.imencode(path.suffix, np.ascontiguousarray(image), options)
+    if not ok:
+        raise OSError(0, f"image {path.name} cannot be encoded")
+    path.write_bytes(data.tobytes())
