@@ -44,6 +44,7 @@ log = logging.getLogger(__name__)
 # viser packs every message once per viewer, so more viewers get fewer updates and the engine keeps its pace.
 REFRESH_S, REFRESH_PER_VIEWER_S = 0.12, 0.02
 MESH_EVERY_S, MESH_PER_VIEWER_S = 1.5, 0.25
+TOAST_CHARACTERS, NOTICE_EVERY_S = 240, 2.0
 DOWNLOAD_LIMIT = 256 * 1024 * 1024
 
 
@@ -67,6 +68,7 @@ class Hub:
         self._newest_lock = threading.Lock()
         self._mesh_asked, self._mesh_pending, self._mesh_frame = 0.0, False, -1
         self._seen_mesh = False
+        self._noticed = 0.0
         self._closing = False
         self.panels: list[BasePanel] = []
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._listen, self._work)]
@@ -150,8 +152,10 @@ class Hub:
 
     def toast(self, title: str, text: str, color: str, client: viser.ClientHandle | None = None) -> None:
         """Tell one viewer something, or all of them."""
+        brief = " ".join(text.split())
+        brief = brief if len(brief) <= TOAST_CHARACTERS else f"{brief[:TOAST_CHARACTERS]} …"
         for viewer in [client] if client is not None else self.viewers():
-            viewer.add_notification(title, text, auto_close_seconds=8.0, color=color)  # type: ignore[call-overload]
+            viewer.add_notification(title, brief, auto_close_seconds=8.0, color=color)  # type: ignore[call-overload]
 
     def deliver(self, client: viser.ClientHandle | None, path: Path) -> None:
         """Say where a file lies and start its download in the browser of who asked for it."""
@@ -261,12 +265,18 @@ class Hub:
         elif isinstance(message, Exported):
             self.jobs.submit(self.deliver, self._askers.pop(message.command_id or -1, None), Path(message.path))
         elif isinstance(message, Notice):
-            color = {"info": "blue", "warning": "yellow"}.get(message.level, "red")
-            self.toast(message.level.capitalize(), message.text, color)
+            self._notice(message)
         elif isinstance(message, LoopEvent):
             self.toast("Loop closed", f"Frame {message.frame + 1}: corrected by {message.correction_cm:.1f} cm", "teal")
         for panel in self.panels:
             panel.event(message)
+
+    def _notice(self, notice: Notice) -> None:
+        now = time.monotonic()
+        if notice.level == "error" or now - self._noticed > NOTICE_EVERY_S:
+            self._noticed = now
+            color = {"info": "blue", "warning": "yellow"}.get(notice.level, "red")
+            self.toast(notice.level.capitalize(), notice.text, color)
 
     def _acknowledged(self, ack: Ack) -> None:
         with self._asking:

@@ -24,12 +24,16 @@ _POLICY = (
     "connect-src 'self' ws://{host} wss://{host} blob: data:; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'none'"
 )
+# A button that was clicked keeps the focus, and the hot key space would press it again: let go of it.
+_LET_GO = "addEventListener('click',e=>{if(e.detail&&e.target.closest('button'))document.activeElement.blur()})"
 
 
 @lru_cache(1)
 def _page() -> tuple[bytes, bytes]:
     text = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text("utf-8")
-    head = f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style></head>'
+    head = (
+        f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style><script>{_LET_GO}</script></head>'
+    )
     body = text.replace("<title>Viser</title>", "").replace("</head>", head, 1).encode()
     return body, gzip.compress(body)
 

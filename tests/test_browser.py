@@ -138,6 +138,7 @@ def test_pause_step_resume_and_hot_keys(live):
     visit.page.mouse.click(300, 300)
     visit.page.keyboard.press("n")
     visit.wait(lambda: visit.frame == before + 2)
+    visit.state("Paused")
     visit.page.keyboard.press("Space")
     visit.wait(lambda: visit.frame > before + 4)
     visit.press("Pause")
