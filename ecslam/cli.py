@@ -1,0 +1,235 @@
+"""The command ``ecslam``. Heavy imports wait until a command needs them, so ``--help`` is quick."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from . import config as configuration
+from .types import InputError
+
+app = typer.Typer(
+    name="ecslam",
+    help="EC-SLAM: neural RGB-D SLAM that you watch live in a browser.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    rich_markup_mode="rich",
+)
+bench = typer.Typer(help="Measure: back ends against each other, speed, accuracy.", no_args_is_help=True)
+app.add_typer(bench, name="bench")
+
+SequenceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="A folder (7-Scenes, TUM RGB-D, Replica, vMAP or ScanNet, recognised by itself) or a built-in room: "
+        "synthetic/studio, synthetic/apartment, synthetic/corridor."
+    ),
+]
+Preset = Annotated[str | None, typer.Option(help="lite, full, live, scannet or tum; default: what suits the layout.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="A YAML file laid over the preset.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="One setting, e.g. mapping.iterations=20; may be repeated."),
+]
+Frames = Annotated[str, typer.Option(metavar="A:B:STEP", help="Which frames, as a Python slice; default: all.")]
+Seed = Annotated[int | None, typer.Option(min=0, help="Random seed; default: the configuration's (0).")]
+Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ... or auto: a CUDA GPU where there is one.")]
+Schedule = Annotated[str | None, typer.Option(help="strict (deterministic on a CPU) or overlap (two threads).")]
+Headless = Annotated[bool, typer.Option("--headless", help="No dashboard: run, write the run folder, end.")]
+Out = Annotated[Path | None, typer.Option(help="Run folder; default: runs/SEQUENCE-PRESET.")]
+Host = Annotated[str, typer.Option(help="Where the dashboard listens; any but 127.0.0.1 needs the token it prints.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the dashboard; 0 = any free one.")]
+NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Do not open a browser; the address is printed.")]
+RunFolder = Annotated[Path, typer.Argument(help="A run folder, as `ecslam run` leaves it.")]
+
+
+@app.command()
+def run(
+    sequence: SequenceArgument,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    frames: Frames = "",
+    seed: Seed = None,
+    device: Device = "auto",
+    schedule: Schedule = None,
+    headless: Headless = False,
+    out: Out = None,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
+    no_browser: NoBrowser = False,
+) -> None:
+    """Run SLAM on a recording or a built-in room; watch it in the browser unless --headless."""
+    from . import commands
+
+    opened = commands.open_sequence(sequence)
+    resolved = resolve_config(preset or opened.preset, config, settings, seed, schedule)
+    folder = out or Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}"
+    engine = commands.make_engine(resolved, sequence, opened, folder, commands.pick_device(device), frames)
+    if headless:
+        commands.run_headless(engine)
+    else:
+        commands.run_with_dashboard(engine, host, port, not no_browser)
+
+
+@app.command()
+def demo(
+    headless: Headless = False,
+    preset: Annotated[str, typer.Option(help="The preset to show.")] = "live",
+    device: Device = "auto",
+    frames: Frames = "",
+    out: Out = None,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
+    no_browser: NoBrowser = False,
+) -> None:
+    """Run on the built-in studio and show the result."""
+    run(
+        "synthetic/studio",
+        preset=preset,
+        device=device,
+        frames=frames,
+        headless=headless,
+        out=out or Path("runs/demo"),
+        host=host,
+        port=port,
+        no_browser=no_browser,
+    )
+
+
+@app.command()
+def resume(
+    folder: RunFolder,
+    device: Device = "auto",
+    headless: Headless = False,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
+    no_browser: NoBrowser = False,
+) -> None:
+    """Go on with an interrupted run from its last checkpoint."""
+    from . import commands
+
+    engine = commands.resume_engine(folder, commands.pick_device(device))
+    if headless:
+        commands.run_headless(engine)
+    else:
+        commands.run_with_dashboard(engine, host, port, not no_browser)
+
+
+@app.command()
+def view(
+    folders: Annotated[list[Path], typer.Argument(help="One run folder, or two to compare.", metavar="RUN [RUN]")],
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
+    no_browser: NoBrowser = False,
+) -> None:
+    """Open finished runs in the browser: scrub through one, or compare two."""
+    from . import commands
+
+    commands.view(folders, host, port, not no_browser)
+
+
+@app.command(name="eval")
+def evaluate(folder: RunFolder) -> None:
+    """Compare a run with its sequence's ground truth: trajectory, Depth L1, Accuracy, Completion, Completion Ratio."""
+    from . import commands
+
+    commands.evaluate(folder)
+
+
+@app.command()
+def mesh(
+    folder: RunFolder,
+    voxel: Annotated[float, typer.Option(min=0.002, max=1.0, help="Voxel size in metres.")] = 0.02,
+    out: Annotated[Path | None, typer.Option(help="File to write: .ply, .glb or .obj; default: RUN/mesh.ply.")] = None,
+) -> None:
+    """Make the mesh of a run again from its map, at any voxel size."""
+    from . import commands
+
+    commands.remesh(folder, voxel, out or folder / "mesh.ply")
+
+
+@app.command()
+def synth(
+    name: Annotated[str, typer.Argument(help="synthetic/studio, synthetic/apartment or synthetic/corridor.")],
+    folder: Annotated[Path, typer.Argument(help="Folder to write, in the Replica layout.")],
+    frames: Frames = "",
+) -> None:
+    """Write a built-in room to disk: images, poses, camera and exact mesh in the Replica layout."""
+    from . import commands
+
+    commands.write_synthetic(name, folder, frames)
+
+
+@app.command()
+def check(sequence: SequenceArgument) -> None:
+    """Say what a folder is and what looks odd about it, before a run."""
+    from .datasets.check import check_sequence, format_report
+
+    typer.echo(format_report(check_sequence(sequence)))
+
+
+@bench.command(name="kernels")
+def bench_kernels(
+    rays: Annotated[int, typer.Option(min=1, help="Rays; 43 samples each.")] = 1000,
+    repeats: Annotated[int, typer.Option(min=3, help="Runs of each; medians are printed.")] = 5,
+    json: Annotated[Path | None, typer.Option(help="Write every figure to this file.")] = None,
+) -> None:
+    """Time the fast back ends against the plain torch reference, in turn, on one mapping and one tracking step."""
+    from . import commands
+    from .bench.kernels import bench_kernels, print_table
+
+    result = bench_kernels(rays, repeats)
+    print_table(result)
+    commands.write_json(json, result)
+
+
+@bench.command(name="speed")
+def bench_speed(
+    sequence: SequenceArgument = "synthetic/studio",
+    presets: Annotated[str, typer.Option(help="Presets to run, separated by commas.")] = "live,lite",
+    frames: Frames = "0:200",
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each; medians are printed.")] = 3,
+    device: Device = "auto",
+    peer: Annotated[bool, typer.Option("--peer", help="Also run Open3D's dense SLAM, if it is installed.")] = False,
+    json: Annotated[Path | None, typer.Option(help="Write every figure to this file.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Write a plot of the cost per frame to this PNG file.")] = None,
+) -> None:
+    """Frames per second, all included; time per stage; growth of cost and memory; a rival beside it."""
+    from . import commands
+    from .bench.speed import bench_speed, plot_speed, print_table
+
+    names = [name.strip() for name in presets.split(",")]
+    result = bench_speed(sequence, names, frames, repeats, commands.pick_device(device), peer)
+    print_table(result)
+    commands.write_json(json, result)
+    if plot is not None:
+        plot_speed(result, plot)
+
+
+def resolve_config(
+    preset: str, file: Path | None, settings: list[str] | None, seed: int | None, schedule: str | None
+) -> configuration.Config:
+    """Preset, then file, then single settings, then seed and schedule. Raises InputError."""
+    resolved = configuration.load_preset(preset)
+    if file is not None:
+        resolved = configuration.load_config(file, resolved)
+    direct = [f"{k}={v}" for k, v in (("seed", seed), ("schedule", schedule)) if v is not None]
+    return configuration.apply_settings(resolved, [*(settings or []), *direct])
+
+
+def main() -> None:
+    """Entry point: a wrong input is one line on stderr and exit code 2, without a traceback."""
+    try:
+        app()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
