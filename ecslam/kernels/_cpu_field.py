@@ -76,8 +76,8 @@ class Scratch(NamedTuple):
     box, rounded, and what rounding lost [6]; inside: 1 or 0 per axis [3];
     enc: features [padded]; jac: their derivatives per metre [3 padded]; bin: first of three bins [3]; coef: bin values
     [9]; slope: d(bin value)/dx at the outer two [6]; hidden: [pitch, 64]; out: TSDF, colour [4]; up: gradients of
-    those before the sigmoid [4]; d_enc [padded]; d_x [3]; turn: for transposing; alpha, before, weight, sharp: rendering.
-    rows: corners of eight cells [64]."""
+    those before the sigmoid [4]; d_enc [padded]; d_x [3]; turn: for transposing; alpha, before, weight, sharp: for
+    rendering; rows: corners of eight cells [64]."""
 
     world: np.ndarray
     x: np.ndarray

@@ -133,17 +133,17 @@ def sdf_terms(z, depth, w, measured, at, s, losses):
 def render_back(z, at, beta, c_r, c_g, c_b, c_d, s, pitch):
     """Through the compositing of one ray: adds to ``s.up``, returns the gradient of beta. c_*: gradients of the
     rendered colour and depth."""
-    d_beta, later = np.float32(0), np.float32(0)
+    d_beta, later = 0.0, 0.0  # later: mean of d_w over what lies behind, in float64 since it nearly cancels d_w
     for j in range(z.shape[0] - 1, -1, -1):
         p = at + j
         r, g, b = s.out[pitch + p], s.out[2 * pitch + p], s.out[3 * pitch + p]
-        w = s.weight[p]
-        d_w = c_r * r + c_g * g + c_b * b + c_d * z[j]
-        d_sigma = d_w * s.before[p] * (1 - s.alpha[p]) - later
-        later += d_w * w
-        sharp = s.sharp[p]
+        alpha = float(s.alpha[p])
+        d_w = float(c_r) * r + float(c_g) * g + float(c_b) * b + float(c_d) * z[j]
+        d_sigma = (d_w - later) * s.before[p] * (1 - alpha)
+        later += alpha * (d_w - later)
+        w, sharp = s.weight[p], s.sharp[p]
         steep = beta * sharp * (1 - sharp)
-        s.up[p] -= d_sigma * beta * steep
+        s.up[p] -= np.float32(d_sigma) * beta * steep
         d_beta += d_sigma * (sharp - s.out[p] * steep)
         s.up[pitch + p] = c_r * w * r * (1 - r)
         s.up[2 * pitch + p] = c_g * w * g * (1 - g)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import operator
 
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
@@ -19,14 +19,14 @@ FLOAT, INT = ir.FloatType(), ir.IntType(32)
 FLOATS, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
 
 
-class FloatVector(types.Type):
+class FloatVector(types.Type):  # type: ignore[misc]
     """Eight float32."""
 
     def __init__(self):
         super().__init__("f32x8")
 
 
-class IntVector(types.Type):
+class IntVector(types.Type):  # type: ignore[misc]
     """Eight int32."""
 
     def __init__(self):
@@ -34,13 +34,13 @@ class IntVector(types.Type):
 
 
 @register_model(FloatVector)
-class _FloatModel(models.PrimitiveModel):
+class _FloatModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager, kind):
         super().__init__(manager, kind, FLOATS)
 
 
 @register_model(IntVector)
-class _IntModel(models.PrimitiveModel):
+class _IntModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager, kind):
         super().__init__(manager, kind, INTS)
 
@@ -274,8 +274,8 @@ def gather(typing, table, rows, start):
             pairs.append(builder.load(_row(context, builder, table, args[0], index), align=4))
 
         def join(order):
-            halves = [_shuffle(builder, pairs[a], pairs[b], range(4)) for a, b in (order[:2], order[2:])]
-            return _shuffle(builder, *halves, range(8))
+            left, right = (_shuffle(builder, pairs[a], pairs[b], range(4)) for a, b in (order[:2], order[2:]))
+            return _shuffle(builder, left, right, range(8))
 
         low, high = join((0, 1, 4, 5)), join((2, 3, 6, 7))
         first = _shuffle(builder, low, high, [0, 2, 8, 10, 4, 6, 12, 14])
@@ -306,7 +306,7 @@ def scatter_add(typing, table, rows, start, a, b):
 def slide(typing, before, a):
     """The last lane of ``before``, then the first seven of a."""
     lanes = range(LANES - 1, 2 * LANES - 1)
-    return a(before, a), lambda context, builder, signature, args: _shuffle(builder, *args, lanes)
+    return a(before, a), lambda context, builder, signature, args: _shuffle(builder, args[0], args[1], lanes)
 
 
 @intrinsic

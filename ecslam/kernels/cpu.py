@@ -140,8 +140,10 @@ def _buffers(chunks: int, points: int, pitch: int, padded: int) -> tuple[int, Fl
 
 
 def _rays(c2w: Tensor, rays: RayBatch) -> Rays:
-    batch = [_array(t) for t in (c2w, rays.direction, rays.z, rays.depth, rays.color)]
-    return Rays(*batch, rays.feature.contiguous().numpy(), rays.pose.contiguous().numpy())
+    direction, z, depth, color = (_array(t) for t in (rays.direction, rays.z, rays.depth, rays.color))
+    return Rays(
+        _array(c2w), direction, z, depth, color, rays.feature.contiguous().numpy(), rays.pose.contiguous().numpy()
+    )
 
 
 def values(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,155 @@
+"""Back ends of the kernel seam against each other, taking turns in one run: what `ecslam bench kernels` prints."""
+
+from __future__ import annotations
+
+import importlib
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from ..config import Config
+from ..field import TsdfField, create_field, map_params
+from ..kernels import AlignSettings, Backend, RayBatch, Weights
+from ..samples import sample_depths
+from ..types import InputError
+
+Job = Callable[[Backend], object]
+
+ROOM = np.array([[-3.0, -2.5, -1.5], [3.5, 2.5, 1.5]])
+ALIGN_POINTS = 2000
+VALUE_POINTS = 43_000
+
+
+def bench_kernels(rays: int = 1000, repeats: int = 5, device: str = "cpu", seed: int = 0) -> dict[str, Any]:
+    """Time the fused back end of ``device`` ("cpu" or "cuda") against the reference on the same work.
+
+    A mapping step (all gradients), a tracking step (poses alone), values at 43,000 points and the normal equations of
+    2,000; lite preset, so 43 samples a ray. Back ends take turns and medians of ``repeats`` are compared, so that a
+    busy machine slows both. Returns plain values: the machine, sizes, milliseconds by job and back end, and the ratios.
+
+    Raises InputError when there are fewer than three repeats or the fused back end cannot run here.
+    """
+    if repeats < 3:
+        raise InputError(f"repeats = {repeats}: a median needs at least 3")
+    fused = "gpu" if device == "cuda" else "cpu"
+    try:
+        backends = {name: _backend(name) for name in ("reference", fused)}
+    except ImportError as error:
+        raise InputError(f"the {fused} kernels cannot run here: {error}") from error
+    jobs = _jobs(rays, torch.device(device), seed)
+    times = {name: _alternate(job, backends, repeats, device) for name, job in jobs.items()}
+    return {
+        "device": device,
+        "machine": torch.cuda.get_device_name() if device == "cuda" else platform.processor() or platform.machine(),
+        "threads": torch.get_num_threads(),
+        "rays": rays,
+        "samples": rays * _samples(Config()),
+        "repeats": repeats,
+        "milliseconds": times,
+        "ratio": {name: t["reference"] / t[fused] for name, t in times.items()},
+    }
+
+
+def print_table(result: dict[str, Any], console: Console | None = None) -> None:
+    """One line a job: milliseconds of each back end and how many times faster the fused one is."""
+    names = list(next(iter(result["milliseconds"].values())))
+    title = (
+        f"{result['machine']}, {result['threads']} threads, {result['samples']:,} samples on {result['rays']:,} rays"
+    )
+    table = Table(title=title)
+    table.add_column("job")
+    for name in names:
+        table.add_column(f"{name} (ms)", justify="right")
+    table.add_column("ratio", justify="right")
+    for job, times in result["milliseconds"].items():
+        table.add_row(job, *(f"{times[name]:.2f}" for name in names), f"{result['ratio'][job]:.1f}")
+    (console or Console()).print(table)
+
+
+def _backend(name: str) -> Backend:
+    return cast(Backend, importlib.import_module(f"..kernels.{name}", __package__))
+
+
+def _samples(config: Config) -> int:
+    return config.sampling.uniform + config.sampling.near_depth
+
+
+def _alternate(job: Job, backends: dict[str, Backend], repeats: int, device: str) -> dict[str, float]:
+    """Median milliseconds by back end; every round runs each once, after one round that is not counted."""
+    spent: dict[str, list[float]] = {name: [] for name in backends}
+    for _ in range(repeats + 1):
+        for name, backend in backends.items():
+            _wait(device)
+            start = time.perf_counter()
+            job(backend)
+            _wait(device)
+            spent[name].append(1e3 * (time.perf_counter() - start))
+    return {name: statistics.median(times[1:]) for name, times in spent.items()}
+
+
+def _wait(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()
+
+
+def _jobs(rays: int, device: torch.device, seed: int) -> dict[str, Job]:
+    """The work, the same for every back end."""
+    config = Config()
+    field = create_field(config.field, ROOM, seed, device)
+    generator = torch.Generator().manual_seed(seed)
+    poses, batch = _batch(rays, config, device, generator)
+    low, high = field.layout.box
+    points = (low + (high - low) * torch.rand(VALUE_POINTS, 3, generator=generator)).to(device)
+    return {"mapping step": _mapping(field, poses, batch), **_reading(field, poses, batch, points)}
+
+
+def _mapping(field: TsdfField, poses: torch.Tensor, batch: RayBatch) -> Job:
+    into = map_params(field.params, torch.empty_like)
+    return lambda kernels: kernels.step(field.layout, field.params, poses, batch, _weights(), into, True)
+
+
+def _reading(field: TsdfField, poses: torch.Tensor, batch: RayBatch, points: torch.Tensor) -> dict[str, Job]:
+    """The jobs that leave the field alone."""
+    layout, params = field.layout, field.params
+    near = points[:ALIGN_POINTS].contiguous()
+    light = torch.rand(len(near), generator=torch.Generator().manual_seed(0)).to(points)
+    settings = AlignSettings(0.06, 0.02, 0.95, 0.0, 1e3, 0.0, 0.1)
+    return {
+        "tracking step": lambda kernels: kernels.step(layout, params, poses, batch, _weights(), None, True),
+        "values": lambda kernels: kernels.values(layout, params, points),
+        "normal equations": lambda kernels: kernels.normal_equations(layout, params, poses[0], near, light, settings),
+    }
+
+
+def _weights() -> Weights:
+    loss, config = Config().mapping.loss, Config()
+    return Weights(
+        loss.free_space, loss.centre, loss.tail, loss.depth_uniform, loss.depth_feature, loss.colour_uniform,
+        loss.colour_feature, config.truncation_m, config.centre_share,
+    )  # fmt: skip
+
+
+def _batch(
+    count: int, config: Config, device: torch.device, generator: torch.Generator
+) -> tuple[torch.Tensor, RayBatch]:
+    """Rays of eight cameras around the middle of a room, looking at its walls through a lens of 60 degrees."""
+    angle = torch.arange(8) * (torch.pi / 4)
+    c2w = torch.eye(4).repeat(8, 1, 1)
+    c2w[:, 0, 0], c2w[:, 0, 2], c2w[:, 2, 0], c2w[:, 2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+    c2w[:, :3, 3] = 0.3 * torch.randn(8, 3, generator=generator)
+    pose = torch.arange(count) * 8 // max(count, 1)
+    direction = torch.cat([1.15 * (torch.rand(count, 2, generator=generator) - 0.5), torch.ones(count, 1)], 1)
+    world = torch.einsum("rij,rj->ri", c2w[pose, :3, :3], direction)
+    low, high = torch.from_numpy(ROOM).float() * 0.9
+    depth = torch.maximum((low - c2w[pose, :3, 3]) / world, (high - c2w[pose, :3, 3]) / world).amin(1)
+    z = sample_depths(depth, depth, config.sampling, generator)
+    color, feature = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) < 0.2
+    parts = (t.to(device) for t in (direction, z, depth, color, feature, pose))
+    return c2w.to(device), RayBatch(*parts)
