@@ -1,4 +1,4 @@
-"""Trajectory files: TUM (``timestamp tx ty tz qx qy qz qw``, read and written) and KITTI (3x4 rows, written)."""
+"""Trajectory files: TUM (``timestamp tx ty tz qx qy qz qw``, read and formatted) and KITTI (3x4 rows, formatted)."""
 
 from __future__ import annotations
 
@@ -32,16 +32,6 @@ def format_kitti(poses: Floats) -> str:
     The format knows a pose by its line number, so one that is not finite is written as ``nan``.
     """
     return "".join(" ".join(map(repr, row)) + "\n" for row in poses[:, :3].reshape(len(poses), 12).tolist())
-
-
-def write_tum(path: Path, timestamps: Floats, poses: Floats) -> None:
-    """``format_tum`` into a file."""
-    Path(path).write_text(format_tum(timestamps, poses), encoding="ascii")
-
-
-def write_kitti(path: Path, poses: Floats) -> None:
-    """``format_kitti`` into a file."""
-    Path(path).write_text(format_kitti(poses), encoding="ascii")
 
 
 def read_tum(path: Path) -> tuple[Floats, Floats]:
