@@ -12,7 +12,7 @@ from .rooms import Room, box, daylight, lamp
 from .shapes import Light, Paint, Shape, Vec, ball, block, can, place, rod
 
 LENGTH, WIDTH, HEIGHT = 9.0, 2.0, 2.6
-FRAMES = 600
+FRAMES = 640
 PANEL_M = 0.5
 DOORS_NORTH, DOORS_SOUTH = (1.4, 4.6, 7.4), (2.9, 6.1)
 

@@ -127,7 +127,7 @@ def _grid_points(numbers, values, box, skip, leaf, local, owner, rotation, cente
             and interior[0, 1] < y < interior[1, 1]
             and interior[0, 2] < z < interior[1, 2]
         )
-        seen[m] = inside and not buried(numbers, values, box, skip, leaf, local, x, y, z, ZERO, k)
+        seen[m] = inside and not buried(numbers, values, box, skip, leaf, local, x, y, z, k)
     return point, up, seen
 
 

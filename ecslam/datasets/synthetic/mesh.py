@@ -16,15 +16,15 @@ from .solids import F
 from .surface import face_of, finish, shade
 from .tracing import build, buried
 
-TOLERANCE_M = 0.0003
+TOLERANCE_M = 0.00015  # along each of two directions
 GRID_M = 0.1
-HIDDEN_M = 0.0005
+LIFT_M = 0.001
 
 Points = NDArray[np.float64]
 
 
 def reference_mesh(shapes: Many[Shape], scene: Scene, interior: NDArray[np.float64]) -> Mesh:
-    """Triangles of all surfaces inside the box ``interior`` [2, 3], without those buried in other solids.
+    """Triangles of all surfaces inside the box ``interior`` [2, 3], without those that another solid covers.
 
     Vertices lie on the solids; colours are those of the pictures, averaged over a few centimetres.
     """
@@ -46,12 +46,13 @@ def _visible(
     scene: Scene, world: Points, owner: NDArray[np.intp], faces: NDArray[np.intp], interior: Points
 ) -> NDArray[np.intp]:
     corner = world[faces]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 2
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = np.linalg.norm(normal, axis=1) / 2
     middle = corner.mean(1)
     keep = (area > 1e-10) & ((middle > interior[0]) & (middle < interior[1])).all(1)
-    faces, middle = faces[keep], middle[keep]
-    hidden = _buried(scene.numbers, scene.values, *build(scene), np.float32(middle), owner[faces[:, 0]], F(HIDDEN_M))
-    return faces[~hidden]
+    above = np.float32(middle[keep] + LIFT_M / 2 * normal[keep] / area[keep, None])
+    hidden = _buried(scene.numbers, scene.values, *build(scene), above, owner[faces[keep, 0]])
+    return faces[keep][~hidden]
 
 
 def _triangulate(shape: Shape) -> tuple[Points, Points, NDArray[np.intp]]:
@@ -167,11 +168,11 @@ def _vertex_normals(points: Points, faces: NDArray[np.intp]) -> Points:
 
 
 @njit(cache=True, nogil=True)
-def _buried(numbers, values, box, skip, leaf, local, points, owner, depth):
+def _buried(numbers, values, box, skip, leaf, local, points, owner):
     out = np.empty(len(points), np.bool_)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        out[i] = buried(numbers, values, box, skip, leaf, local, x, y, z, depth, owner[i])
+        out[i] = buried(numbers, values, box, skip, leaf, local, x, y, z, owner[i])
     return out
 
 

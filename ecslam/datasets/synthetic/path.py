@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
 
 PACE_M, PACE_DEG = 0.017, 1.05
 SWAY_M, SWAY_DEG = 0.005, 0.4
+SETTLE_FRAMES = 6.0
 SAMPLES = 8192
 
 
@@ -43,8 +45,10 @@ def closed_path(waypoints: Many[Waypoint], frames: int, seed: int) -> NDArray[np
 
     fine = np.linspace(0, 1, SAMPLES + 1)
     done = np.concatenate([[0], np.cumsum(_pace(np.diff(curve(fine), axis=0)))])
-    even = np.interp(np.arange(frames) / frames * done[-1], done, fine)
-    return poses(curve(even) + _sway(frames, seed))
+    share = np.arange(frames)[:, None] / frames
+    even = curve(np.interp(share[:, 0] * done[-1], done, fine)) - share * turns
+    calm = gaussian_filter1d(even, SETTLE_FRAMES, axis=0, mode="wrap") + share * turns
+    return poses(calm + _sway(frames, seed))
 
 
 def _pace(steps: NDArray[np.float64]) -> NDArray[np.float64]:

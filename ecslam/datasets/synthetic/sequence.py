@@ -6,7 +6,7 @@ import importlib
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ def room(name: str) -> Room:
     return built
 
 
-@lru_cache(maxsize=2)
+@cache
 def _lit_scene(name: str) -> Scene:
     built = room(name)
     return bake(pack(built.shapes), built.lights, built.interior)

@@ -99,8 +99,8 @@ def trace(numbers, values, box, skip, leaf, local, ox, oy, oz, dx, dy, dz, limit
 
 
 @lean
-def buried(numbers, values, box, skip, leaf, local, x, y, z, depth, owner):
-    """Whether a point lies more than ``depth`` metres inside a shape other than ``owner``."""
+def buried(numbers, values, box, skip, leaf, local, x, y, z, owner):
+    """Whether a point lies inside a shape other than ``owner``."""
     node = 0
     while node < len(skip):
         n = at(node)
@@ -113,6 +113,6 @@ def buried(numbers, values, box, skip, leaf, local, x, y, z, depth, owner):
         if k >= 0 and k != owner:
             kind, hx, hy, hz, extra = solid(numbers, values, k)
             px, py, pz = to_local(local, k, x, y, z, ONE)
-            if distance(kind, hx, hy, hz, extra, px, py, pz) < -depth:
+            if distance(kind, hx, hy, hz, extra, px, py, pz) < ZERO:
                 return True
     return False
