@@ -8,6 +8,7 @@ as if in float64: agrees with the float64 reference to about 1e-6.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -63,7 +64,7 @@ class _Workspace(threading.local):
 
     def array(self, name: str, *shape: int) -> Floats:
         """An uninitialised float32 array that lives until the next request of that name."""
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         held = self.buffers.get(name)
         if held is None or held.size < size:
             held = self.buffers[name] = np.empty(size, np.float32)
