@@ -1,0 +1,1 @@
+"""Measurements as commands: the kernels against each other (``kernels``), whole runs and a rival (``speed``)."""

@@ -1,0 +1,203 @@
+"""Whole runs, timed: what `ecslam bench speed` prints. Every run has a process of its own, so memory is its own too."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import platform
+import resource
+import statistics
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from ..config import Config, load_config, load_preset
+from ..runtime.checkpoint import load_checkpoint
+from ..runtime.engine import Engine
+from ..runtime.tally import peak_memory_mb
+from .peer import measure_open3d, open3d_missing
+
+SPAN = 200
+SMOOTH = 25
+PEER = "Open3D dense SLAM"
+
+Figures = dict[str, Any]
+
+
+def bench_speed(
+    sequence: str, presets: list[str], frames: str, repeats: int, device: str, peer: bool = False
+) -> Figures:
+    """Run each preset ``repeats`` times on the same frames, taking turns, and compare medians.
+
+    presets: names of presets, or YAML files. Returns plain values: the machine; under ``presets`` for each one the
+    medians of what ``measure`` gives; under ``peer`` the rival's (None without it, ``peer_note`` says why); under
+    ``ratio`` wall-clock frames/s over the rival's. Raises InputError for a preset or a sequence that cannot be used.
+    """
+    for preset in presets:
+        _config(preset)
+    note = open3d_missing() if peer else ""
+    jobs: dict[str, tuple[Callable[..., Figures], tuple[str, ...]]] = {
+        preset: (measure, (sequence, preset, frames, device)) for preset in presets
+    }
+    if peer and not note:
+        jobs[PEER] = (measure_open3d, (sequence, frames, device))
+    runs: dict[str, list[Figures]] = {name: [] for name in jobs}
+    for turn in range(repeats):
+        for name, (job, arguments) in jobs.items():
+            runs[name].append(_in_own_process(job, arguments))
+            _say(f"{name}, run {turn + 1} of {repeats}: {runs[name][-1]['fps_wall']:.2f} frames/s")
+    medians = {name: _medians(found) for name, found in runs.items()}
+    rival = medians.pop(PEER, None)
+    return {
+        "sequence": sequence,
+        "frames": frames,
+        "device": device,
+        "machine": torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.machine(),
+        "threads": torch.get_num_threads(),
+        "repeats": repeats,
+        "presets": medians,
+        "peer": rival,
+        "peer_note": note,
+        "ratio": {name: m["fps_wall"] / rival["fps_wall"] for name, m in medians.items()} if rival else {},
+    }
+
+
+def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
+    """One headless run in a temporary folder.
+
+    frames_done; fps_wall (everything), fps_engine (tracking and mapping after the first frame), ate_rmse_cm;
+    first_map_ms; track_ms and map_ms, means over the frames after the first; cost_ms, their sum for each frame, the
+    first left out; peak_memory_mb, stored_keyframes_mb. Growth from the mean over frames 200-400 to the mean over the
+    last 200, None under 600 frames: cost_growth (a ratio), memory_growth_mb (of resident memory), and
+    keyframe_growth_mb (what the keyframes stored in between weigh). Raises InputError.
+    """
+    memory: dict[int, float] = {}
+    with tempfile.TemporaryDirectory(prefix="ecslam-bench-") as parent:
+        folder = Path(parent) / "run"
+        engine = Engine(_config(preset), sequence, folder, device=device, frames=frames)
+        summary = engine.run(lambda snapshot: memory.update({snapshot.frame: _resident_mb()}))
+        lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        arrays = load_checkpoint(folder / "checkpoints").arrays
+    stored_mb = sum(a.nbytes for name, a in arrays.items() if name.startswith("keyframes.")) / 1e6
+    track, mapped = (np.array([line[key] for line in lines[1:]]) for key in ("track_ms", "map_ms"))
+    chosen = ("fps_wall", "fps_engine", "ate_rmse_cm", "peak_memory_mb")
+    return {
+        "frames_done": summary["frames"],
+        **{name: summary[name] for name in chosen},
+        "first_map_ms": lines[0]["map_ms"],
+        "track_ms": float(track.mean()) if len(track) else 0.0,
+        "map_ms": float(mapped.mean()) if len(mapped) else 0.0,
+        "stored_keyframes_mb": stored_mb,
+        **_growth(track + mapped, memory, arrays["keyframes.frame"], stored_mb),
+        "cost_ms": (track + mapped).tolist(),
+    }
+
+
+def print_table(result: Figures, console: Console | None = None) -> None:
+    """One line a preset, the rival last."""
+    console = console or Console()
+    title = f"{result['sequence']} {result['frames']}, {result['machine']}, medians of {result['repeats']}"
+    table = Table(title=title)
+    table.add_column("preset")
+    headings = ("frames/s wall", "engine", "ATE cm", "track ms", "map ms", "late/early", "peak MB", "keyframes MB")
+    for heading in (*headings, "x rival") if result["peer"] else headings:
+        table.add_column(heading, justify="right")
+    keys = ("fps_wall", "fps_engine", "ate_rmse_cm", "track_ms", "map_ms", "cost_growth")
+    for name, m in result["presets"].items():
+        row = [_cell(m[key], 2) for key in keys] + [_cell(m[k], 1) for k in ("peak_memory_mb", "stored_keyframes_mb")]
+        table.add_row(name, *row, *([_cell(result["ratio"][name], 2)] if result["peer"] else []))
+    if result["peer"]:
+        m = result["peer"]
+        blanks = [""] * (len(headings) - 3)
+        table.add_row(PEER, _cell(m["fps_wall"], 2), "", _cell(m["ate_rmse_cm"], 2), *blanks, "1.00")
+    console.print(table)
+    for name, m in result["presets"].items():
+        if m["memory_growth_mb"] is not None:
+            console.print(
+                f"{name}: from frames {SPAN}-{2 * SPAN} to the last {SPAN} memory grew by {m['memory_growth_mb']:.1f} "
+                f"MB; the keyframes stored in between weigh {m['keyframe_growth_mb']:.1f} MB"
+            )
+    if result["peer_note"]:
+        console.print(result["peer_note"])
+
+
+def plot_speed(result: Figures, path: Path) -> None:
+    """Write a PNG: milliseconds per frame over the frames, smoothed, a line a preset; the rival's mean dashed."""
+    figure = Figure(figsize=(9, 4.5), dpi=120, layout="constrained")
+    axes = figure.add_subplot()
+    for name, m in result["presets"].items():
+        width = min(SMOOTH, len(m["cost_ms"]))
+        if width:
+            smooth = np.convolve(m["cost_ms"], np.full(width, 1 / width), "valid")
+            axes.plot(np.arange(len(smooth)) + 1 + width // 2, smooth, label=f"{name}: {m['fps_wall']:.1f} frames/s")
+    if result["peer"]:
+        fps = result["peer"]["fps_wall"]
+        axes.axhline(1e3 / fps, color="grey", linestyle="--", label=f"{PEER}: {fps:.1f} frames/s, all included")
+    axes.set(title=f"{result['sequence']} on {result['machine']}", xlabel="frame", ylabel="tracking + mapping (ms)")
+    axes.set_ylim(bottom=0)
+    axes.legend(frameon=False)
+    figure.savefig(path, format="png")
+
+
+def _config(preset: str) -> Config:
+    return load_config(Path(preset)) if preset.endswith((".yaml", ".yml")) else load_preset(preset)
+
+
+def _in_own_process(job: Callable[..., Figures], arguments: tuple[str, ...]) -> Figures:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(job, *arguments).result()
+
+
+def _say(text: str) -> None:
+    Console(stderr=True).print(text, highlight=False)
+
+
+def _medians(runs: list[Figures]) -> Figures:
+    """Key by key; frame by frame where there is a list; None where there is nothing to compare."""
+    out: Figures = {}
+    for key, first in runs[0].items():
+        values = [run[key] for run in runs]
+        if first is None:
+            out[key] = None
+        elif isinstance(first, list):
+            out[key] = [statistics.median(v) for v in zip(*values, strict=False)]
+        else:
+            out[key] = statistics.median(values)
+    return out
+
+
+def _growth(
+    cost_ms: np.ndarray[Any, Any], memory: dict[int, float], keyframes: np.ndarray[Any, Any], stored_mb: float
+) -> Figures:
+    """See ``measure``. memory: resident megabytes by frame; keyframes: [k] their frames."""
+    count = len(cost_ms) + 1
+    if count < 3 * SPAN:
+        return {"cost_growth": None, "memory_growth_mb": None, "keyframe_growth_mb": None}
+    early, late = range(SPAN, 2 * SPAN), range(count - SPAN, count)
+    resident = [np.mean([mb for frame, mb in memory.items() if frame in span]) for span in (early, late)]
+    between = (keyframes >= 1.5 * SPAN) & (keyframes < count - SPAN / 2)
+    return {
+        "cost_growth": float(cost_ms[-SPAN:].mean() / cost_ms[SPAN - 1 : 2 * SPAN - 1].mean()),
+        "memory_growth_mb": float(resident[1] - resident[0]),
+        "keyframe_growth_mb": float(stored_mb * between.mean()),
+    }
+
+
+def _resident_mb() -> float:
+    """Memory of this process now; the most it has had where the system does not tell."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+    except (OSError, IndexError, ValueError):
+        return peak_memory_mb()
+
+
+def _cell(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
