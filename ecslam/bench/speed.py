@@ -27,7 +27,20 @@ from .peer import measure_open3d, open3d_missing
 
 SPAN = 200
 SMOOTH = 25
-PEER = "Open3D dense SLAM"
+PEER = "Open3D"
+ROWS = {
+    "fps_wall": "frames/s, all included",
+    "fps_engine": "frames/s, engine alone",
+    "ate_rmse_cm": "ATE RMSE (cm)",
+    "first_map_ms": "first mapping (ms)",
+    "track_ms": "tracking (ms a frame)",
+    "map_ms": "mapping (ms a frame)",
+    "cost_growth": f"cost, last {SPAN} over {SPAN}-{2 * SPAN}",
+    "peak_memory_mb": "peak memory (MB)",
+    "stored_keyframes_mb": "stored keyframes (MB)",
+    "memory_growth_mb": f"memory grown since {SPAN}-{2 * SPAN} (MB)",
+    "keyframe_growth_mb": "keyframes stored since (MB)",
+}
 
 Figures = dict[str, Any]
 
@@ -102,29 +115,21 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
 
 
 def print_table(result: Figures, console: Console | None = None) -> None:
-    """One line a preset, the rival last."""
+    """A column for each preset and for the rival, a line for each figure."""
     console = console or Console()
     title = f"{result['sequence']} {result['frames']}, {result['machine']}, medians of {result['repeats']}"
+    columns = result["presets"] | ({PEER: result["peer"]} if result["peer"] else {})
     table = Table(title=title)
-    table.add_column("preset")
-    headings = ("frames/s wall", "engine", "ATE cm", "track ms", "map ms", "late/early", "peak MB", "keyframes MB")
-    for heading in (*headings, "x rival") if result["peer"] else headings:
-        table.add_column(heading, justify="right")
-    keys = ("fps_wall", "fps_engine", "ate_rmse_cm", "track_ms", "map_ms", "cost_growth")
-    for name, m in result["presets"].items():
-        row = [_cell(m[key], 2) for key in keys] + [_cell(m[k], 1) for k in ("peak_memory_mb", "stored_keyframes_mb")]
-        table.add_row(name, *row, *([_cell(result["ratio"][name], 2)] if result["peer"] else []))
-    if result["peer"]:
-        m = result["peer"]
-        blanks = [""] * (len(headings) - 3)
-        table.add_row(PEER, _cell(m["fps_wall"], 2), "", _cell(m["ate_rmse_cm"], 2), *blanks, "1.00")
+    table.add_column("")
+    for name in columns:
+        table.add_column(name, justify="right", overflow="fold")
+    for key, label in ROWS.items():
+        cells = [_cell(m.get(key)) for m in columns.values()]
+        if any(cells):
+            table.add_row(label, *cells)
+    if result["ratio"]:
+        table.add_row("times the rival's frames/s", *(_cell(result["ratio"].get(name)) for name in columns))
     console.print(table)
-    for name, m in result["presets"].items():
-        if m["memory_growth_mb"] is not None:
-            console.print(
-                f"{name}: from frames {SPAN}-{2 * SPAN} to the last {SPAN} memory grew by {m['memory_growth_mb']:.1f} "
-                f"MB; the keyframes stored in between weigh {m['keyframe_growth_mb']:.1f} MB"
-            )
     if result["peer_note"]:
         console.print(result["peer_note"])
 
@@ -199,5 +204,5 @@ def _resident_mb() -> float:
         return peak_memory_mb()
 
 
-def _cell(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+def _cell(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
