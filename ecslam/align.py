@@ -6,7 +6,8 @@ control keep it from diverging on plain walls and fast turns; the luminance term
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -38,19 +39,17 @@ def align(
     points: Tensor,
     luminance: Tensor,
     guess: NDArray[np.float64],
-    settings: AlignSettings,
-    kernel_schedule_m: tuple[float, ...],
+    stages: Sequence[AlignSettings],
     iterations: int,
 ) -> Alignment:
     """Move camera points [N, 3] (metres, luminance [N] in 0..1) from ``guess`` [4, 4] onto the map's surface.
 
-    The Geman-McClure scale goes through ``kernel_schedule_m``; at most ``iterations`` evaluations for each.
+    Coarse to fine through ``stages``, at most ``iterations`` steps in each.
     """
     c2w = torch.from_numpy(guess)
     total, steps = len(points), 0
-    equations, stage = None, settings
-    for kernel in kernel_schedule_m:
-        stage = replace(settings, kernel_m=kernel)
+    equations, stage = None, stages[0]
+    for stage in stages:
         equations = _evaluate(field, kernels, c2w, points, luminance, stage)
         damping = DAMPING[0]
         for _ in range(iterations):

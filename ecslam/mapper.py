@@ -82,7 +82,7 @@ class Mapper:
         for iteration in range(iterations):
             if interrupt is not None:
                 interrupt()
-            pixels, row = gather(views, self._pick(views, m.rays))
+            pixels, row = gather(views, self._pick(views, m.rays, m.newest_share))
             rays = make_rays(pixels, row, poses.c2w, field.layout.box, config, self._generator, device)
             rays = resample_missing(rays, poses.c2w.float(), field, self.kernels, config.sampling, self._generator)
             result = self.kernels.step(
@@ -130,10 +130,12 @@ class Mapper:
         groups = self._optimiser.state_dict()["param_groups"]
         self._optimiser.load_state_dict({"state": moments, "param_groups": groups})
 
-    def _pick(self, views: Sequence[Pixels], rays: int) -> list[NDArray[np.int64]]:
-        """An equal share of the rays for every view."""
-        share = -(-rays // len(views))
-        return [self._rng.integers(0, len(view), share) for view in views]
+    def _pick(self, views: Sequence[Pixels], rays: int, newest_share: float) -> list[NDArray[np.int64]]:
+        """The newest view gets ``newest_share`` of the rays (or an equal share if that is more), the others the rest."""
+        newest = max(round(rays * newest_share), -(-rays // len(views)))
+        older = -(-(rays - newest) // max(len(views) - 1, 1))
+        counts = [older] * (len(views) - 1) + [newest]
+        return [self._rng.integers(0, len(view), count) for view, count in zip(views, counts, strict=True)]
 
     def grow(self, box: NDArray[np.float64], config: Config) -> None:
         """Extend the field to the union of its box and ``box`` [2, 3]; values inside and the Adam state are kept."""

@@ -22,6 +22,7 @@ from .keyframes import Keyframe, make_thumbnail, most_similar
 from .loops import LoopDetector
 from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
+from .observed import ObservedVoxels
 from .pixels import Pixels, choose_pixels
 from .recovery import Recovery, best_start
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
@@ -62,6 +63,7 @@ class Slam:
         self._bounds = bounds if box is None else np.array(box, np.float64).reshape(2, 3)
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
+        self._observed = ObservedVoxels()
         self._loops, self._recovery = LoopDetector(), Recovery()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
         self._pending: Future[MapResult] | None = None
@@ -115,13 +117,14 @@ class Slam:
         self._frozen = field
         self.trajectory.append(self._first_pose, frame.timestamp, True, keyframe=True)
         self.keyframes.append(keyframe)
+        self._window = np.array([0])
         try:
             result = self._optimise(np.array([0]), self.config.mapping.first_iterations, interrupt)
         except BaseException:
             self.mapper = self._frozen = None
             self.trajectory, self.keyframes = Trajectory(), []
             raise
-        self._frozen = self._tracking_field()
+        self._apply(result)
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,
@@ -152,10 +155,19 @@ class Slam:
         field = self._require_field()
         guess = self.trajectory.predict() if not self._recovery.lost else self.trajectory[-1]
         usable = len(pixels.points()) >= 64
+        if usable:
+            pixels = self._known(pixels, guess)
         track = self._track_from(field, pixels, guess) if usable else TrackResult(guess, {}, 0.0)
         return self._recovery.judge(
             track, self.trajectory[-1], lambda: self._relocalise(field, frame, pixels) if usable else None
         )
+
+    def _known(self, pixels: Pixels, guess: NDArray[np.float64]) -> Pixels:
+        """The pixels whose measured point, seen from ``guess``, lies where the map has been observed; all of them when
+        that leaves too few."""
+        local = np.concatenate([pixels.direction, np.ones((len(pixels), 1), np.float32)], 1) * pixels.depth[:, None]
+        known = self._observed.contains(local @ guess[:3, :3].T + guess[:3, 3]) & (pixels.depth > 0)
+        return pixels.take(np.flatnonzero(known)) if known.sum() >= 100 else pixels
 
     def _track_from(self, field: TsdfField, pixels: Pixels, guess: NDArray[np.float64]) -> TrackResult:
         if self.config.tracking.method == "lm":
@@ -219,6 +231,8 @@ class Slam:
         return random_window(len(poses), rays, self.config.window, self._rng)
 
     def _apply(self, result: MapResult) -> None:
+        trained = max(len(self.keyframes) - 2, 0)  # its surface has been through two mappings by now
+        self._observed.add(_world(self.keyframes[trained].pixels, self.trajectory.keyframe_poses()[trained]))
         if np.isfinite(result.c2w).all():
             self.trajectory.move_keyframes(self._window, result.c2w)
         self._frozen = self._tracking_field()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from .pose_adam import PoseAdam
 from .rays import kernel_weights, make_rays
 from .samples import resample_missing
 
+WIDE_GRADIENT = (0.3, 2.0)
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255
 
 
@@ -78,14 +79,17 @@ def track_direct(
     has = pixels.depth > 0
     points = torch.from_numpy(pixels.points()).to(field.device)
     luminance = torch.from_numpy(pixels.color[has].astype(np.float32) @ _LUMINANCE).to(field.device)
-    settings = AlignSettings(
+    wide = AlignSettings(
         truncation_m=config.truncation_m,
-        kernel_m=t.kernels_m[0],
+        kernel_m=0.0,
         tsdf_limit=t.tsdf_limit,
-        gradient_low=t.gradient_range[0],
-        gradient_high=t.gradient_range[1],
+        gradient_low=WIDE_GRADIENT[0],
+        gradient_high=WIDE_GRADIENT[1],
         colour_weight=t.colour_weight_m,
         colour_kernel=t.colour_kernel,
     )
-    found = align(field, kernels, points, luminance, guess, settings, t.kernels_m, t.iterations)
+    stages = [replace(wide, kernel_m=kernel) for kernel in t.kernels_m]
+    low, high = t.gradient_range
+    stages[-1] = replace(stages[-1], gradient_low=low, gradient_high=high)
+    found = align(field, kernels, points, luminance, guess, stages, t.iterations)
     return TrackResult(found.c2w, {"align_mm": 1e3 * found.cost**0.5}, fit(field, kernels, pixels, found.c2w))
