@@ -127,15 +127,17 @@ def finish_run(engine: Engine, summary: dict[str, Any]) -> None:
 
 
 def draw_picture(folder: Path) -> Path | None:
-    """``picture.png``: mesh and trajectories of a run folder; None when it has no mesh."""
+    """``picture.png``: mesh and trajectories of a run folder; None when it has no mesh, or an empty one."""
     from .evaluation.plots import plot_run
 
-    if not (folder / "mesh.ply").is_file():
+    try:
+        mesh = read_mesh(folder / "mesh.ply")
+    except InputError:
         return None
     times, poses = read_tum(folder / "trajectory.txt")
     truth = read_truth(folder, times)
     summary = json.loads((folder / "summary.json").read_text())
-    plot_run(folder / "picture.png", read_mesh(folder / "mesh.ply"), poses, truth, title=_title(summary))
+    plot_run(folder / "picture.png", mesh, poses, truth, title=_title(summary))
     return folder / "picture.png"
 
 

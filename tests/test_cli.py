@@ -1,0 +1,268 @@
+"""The command line as a person meets it: one small run through every command, and one clear line for a wrong input."""
+
+import contextlib
+import io
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+import torch
+
+from ecslam import cli
+from ecslam.commands import draw_picture
+from ecslam.config import load_config, load_preset
+from ecslam.datasets.meshes import load_mesh
+from ecslam.runtime.mesh_files import mesh_bytes
+from ecslam.types import Mesh
+
+ROOM = "synthetic/studio?size=160x120"
+SETTINGS = {
+    "field.levels": 8,
+    "field.log2_table_size": 14,
+    "mapping.first_iterations": 40,
+    "mapping.iterations": 4,
+    "mapping.rays": 500,
+    "tracking.iterations": 4,
+    "tracking.rays": 200,
+}
+SUMMARY_KEYS = {
+    "sequence", "preset", "device", "kernels", "seed", "frames", "keyframes", "wall_s", "fps_wall", "fps_engine",
+    "ate_rmse_cm", "ate_mean_cm", "ate_max_cm", "parameters", "parameters_mb", "peak_memory_mb", "skipped_frames",
+    "lost_frames", "loop_closures",
+}  # fmt: skip
+EVALUATED_KEYS = {"depth_l1_cm", "accuracy_cm", "completion_cm", "completion_ratio"}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    code: int
+    out: str
+    err: str
+
+
+def ecslam(*words: object) -> Outcome:
+    """What the command ``ecslam`` does with these words."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    arguments = mock.patch.object(sys, "argv", ["ecslam", *map(str, words)])
+    with arguments, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Outcome(code, out.getvalue(), err.getvalue())
+
+
+def run_words(sequence: Path, out: Path) -> list[object]:
+    settings = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
+    return ["run", sequence, "--headless", "--preset", "lite", "--device", "cpu", "--seed", 3, *settings, "--out", out]
+
+
+@pytest.fixture(scope="session")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight small frames of a built-in room, written by ``synth``."""
+    folder = tmp_path_factory.mktemp("cli") / "room"
+    done = ecslam("synth", ROOM, folder, "--frames", "0:8")
+    assert done.code == 0, done.err
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a small run."""
+    folder = tmp_path_factory.mktemp("cli") / "run"
+    done = ecslam(*run_words(sequence, folder))
+    assert done.code == 0, done.err
+    assert str(folder / "mesh.ply") in done.out
+    return folder
+
+
+def summary(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def assert_refused(outcome: Outcome, *parts: str) -> None:
+    """One line that names what is wrong, and exit code 2."""
+    assert outcome.code == 2, outcome.out
+    assert outcome.err.count("\n") == 1
+    assert outcome.err.startswith("error: ")
+    for part in parts:
+        assert part in outcome.err
+
+
+# ---- a small run ----------------------------------------------------------------------------------------------------
+
+
+def test_synth_writes_what_check_accepts(sequence):
+    assert {p.name for p in sequence.iterdir()} == {"results", "traj.txt", "cam_params.json", "mesh.ply"}
+    report = ecslam("check", sequence)
+    assert report.code == 0
+    for part in ("replica", "160x120", "8 of 8", "path"):
+        assert part in report.out
+
+
+def test_check_says_what_looks_odd(sequence, tmp_path):
+    broken = shutil.copytree(sequence, tmp_path / "room")
+    image = broken / "results" / "depth000002.png"
+    image.write_bytes(image.read_bytes()[:200])
+    report = ecslam("check", broken)
+    assert report.code == 0
+    assert "depth000002.png" in report.out
+
+
+def test_summary_has_the_keys_that_others_rely_on(finished, sequence):
+    found = summary(finished)
+    assert found.keys() >= SUMMARY_KEYS
+    assert (found["frames"], found["keyframes"], found["seed"], found["preset"]) == (8, 2, 3, "lite")
+    assert (found["skipped_frames"], found["lost_frames"]) == (0, 0)
+    assert found["ate_mean_cm"] <= found["ate_rmse_cm"] <= found["ate_max_cm"]
+    assert found["parameters_mb"] == pytest.approx(4e-6 * found["parameters"], abs=1e-3)
+
+
+def test_run_folder_is_complete(finished):
+    names = {p.name for p in finished.iterdir()}
+    assert names >= {"config.yaml", "trajectory.txt", "events.jsonl", "metrics.jsonl", "mesh.ply", "summary.json"}
+    assert (finished / "picture.png").read_bytes().startswith(b"\x89PNG")
+    assert len((finished / "metrics.jsonl").read_text().splitlines()) == 8
+    assert np.loadtxt(finished / "trajectory.txt").shape == (8, 8)
+
+
+def test_saved_configuration_is_the_one_that_ran(finished):
+    saved = load_config(finished / "config.yaml")
+    assert saved == cli.resolve_config("lite", None, [f"{k}={v}" for k, v in SETTINGS.items()], 3, None)
+    assert saved != load_preset("lite")
+
+
+def test_evo_finds_the_same_error(finished):
+    metrics = pytest.importorskip("evo.core.metrics")
+    from evo.core.sync import associate_trajectories
+    from evo.tools.file_interface import read_tum_trajectory_file
+
+    truth, ours = (read_tum_trajectory_file(str(finished / f"{n}.txt")) for n in ("groundtruth", "trajectory"))
+    truth, ours = associate_trajectories(truth, ours)
+    ours.align(truth)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((truth, ours))
+    assert summary(finished)["ate_rmse_cm"] == pytest.approx(100 * ape.get_statistic(metrics.StatisticsType.rmse), 0.01)
+
+
+def test_same_seed_gives_the_same_bytes(finished, sequence, tmp_path):
+    assert ecslam(*run_words(sequence, tmp_path / "again")).code == 0
+    assert (tmp_path / "again" / "trajectory.txt").read_bytes() == (finished / "trajectory.txt").read_bytes()
+
+
+def test_eval_finds_a_mesh_equal_to_itself(finished, sequence, tmp_path):
+    room, folder = shutil.copytree(sequence, tmp_path / "room"), shutil.copytree(finished, tmp_path / "run")
+    shutil.copy(folder / "mesh.ply", room / "mesh.ply")
+    about = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(about | {"sequence": str(room)}))
+    before = summary(folder)
+    done = ecslam("eval", folder)
+    assert done.code == 0, done.err
+    after = summary(folder)
+    assert after.keys() >= SUMMARY_KEYS | EVALUATED_KEYS
+    assert after["ate_rmse_cm"] == pytest.approx(before["ate_rmse_cm"])
+    assert max(after["accuracy_cm"], after["completion_cm"]) < 0.5
+    assert after["completion_ratio"] > 99.9
+    assert "completion_ratio" in done.out
+
+
+def test_mesh_is_made_again_at_another_size(finished, tmp_path):
+    sizes = []
+    for voxel in (0.04, 0.08):
+        done = ecslam("mesh", finished, "--voxel", voxel, "--out", tmp_path / f"{voxel}.ply")
+        assert done.code == 0, done.err
+        sizes.append(len(load_mesh(tmp_path / f"{voxel}.ply").faces))
+    assert sizes[0] > 2 * sizes[1] > 0
+
+
+def test_a_run_without_a_surface_ends_without_a_picture(finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run", ignore=shutil.ignore_patterns("picture.png"))
+    empty = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    (folder / "mesh.ply").write_bytes(mesh_bytes(empty, "ply"))
+    assert draw_picture(folder) is None
+    assert not (folder / "picture.png").exists()
+
+
+# ---- wrong inputs ---------------------------------------------------------------------------------------------------
+
+
+def test_an_empty_folder(tmp_path):
+    assert_refused(ecslam("run", tmp_path, "--headless"), str(tmp_path), "empty folder")
+
+
+def test_a_folder_of_no_known_layout(tmp_path):
+    (tmp_path / "holiday.mp4").write_bytes(b"")
+    outcome = ecslam("run", tmp_path, "--headless")
+    assert_refused(outcome, str(tmp_path), "no known layout", "holiday.mp4", "TUM RGB-D", "7-Scenes")
+
+
+def test_a_missing_depth_image(sequence, tmp_path):
+    broken = shutil.copytree(sequence, tmp_path / "room")
+    (broken / "results" / "depth000003.png").unlink()
+    outcome = ecslam("run", broken, "--headless", "--out", tmp_path / "run")
+    assert_refused(outcome, str(broken), "000003", "depth image")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["--set", "mapping.iteration=3"], ["mapping.iteration'", "did you mean 'mapping.iterations'"]),
+        (["--set", "mapping.iterations"], ["key=value"]),
+        (["--set", "mapping.iterations=many"], ["mapping.iterations", "whole number"]),
+        (["--set", "mapping.rays=1"], ["mapping.rays", "out of range"]),
+        (["--preset", "ful"], ["'ful'", "did you mean 'full'"]),
+        (["--config", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
+        (["--schedule", "loose"], ["schedule", "strict", "overlap"]),
+        (["--frames", "8"], ["--frames 8", "A:B"]),
+        (["--frames", "90:99"], ["selects nothing", "0 .. 7"]),
+        (["--frames", "5:0:-1"], ["--frames 5:0:-1", "STEP"]),
+        (["--device", "tpu9"], ["--device tpu9", "cpu, cuda"]),
+    ],
+)
+def test_a_wrong_option(sequence, tmp_path, words, parts):
+    assert_refused(ecslam("run", sequence, "--headless", "--out", tmp_path / "run", *words), *parts)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_a_gpu_that_is_not_there(sequence, tmp_path):
+    outcome = ecslam("run", sequence, "--headless", "--device", "cuda", "--out", tmp_path / "run")
+    assert_refused(outcome, "--device cuda", "--device cpu")
+
+
+@pytest.mark.parametrize("command", ["eval", "mesh", "resume"])
+def test_a_folder_that_holds_no_run(command, tmp_path):
+    assert_refused(ecslam(command, tmp_path), str(tmp_path))
+
+
+def test_a_folder_with_other_things_in_it_is_not_written_to(sequence, tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    assert_refused(ecslam("run", sequence, "--headless", "--out", tmp_path), str(tmp_path), "--out")
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_unknown_rooms_and_mesh_formats(finished, tmp_path):
+    assert_refused(ecslam("check", "synthetic/studo"), "did you mean synthetic/studio")
+    assert_refused(ecslam("synth", "studio", tmp_path / "x"), "synthetic/studio")
+    assert_refused(ecslam("mesh", finished, "--out", tmp_path / "mesh.stl"), "mesh.stl", ".ply")
+
+
+def test_the_installed_command_refuses_without_a_traceback(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "ecslam.cli", "check", str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert_refused(Outcome(done.returncode, done.stdout, done.stderr), "empty folder")
+
+
+def test_help_names_every_command():
+    text = ecslam("--help").out
+    for command in ("run", "demo", "resume", "view", "eval", "mesh", "synth", "check", "bench"):
+        assert f" {command} " in text
