@@ -67,7 +67,7 @@ def run(
     from . import commands
 
     opened = commands.open_sequence(sequence)
-    resolved = resolve_config(preset or opened.preset, config, settings, seed, schedule)
+    resolved = resolve_config(preset or opened.preset, opened.layout, config, settings, seed, schedule)
     folder = out or Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}"
     engine = commands.make_engine(resolved, sequence, opened, folder, commands.pick_device(device), frames)
     if headless:
@@ -212,10 +212,15 @@ def bench_speed(
 
 
 def resolve_config(
-    preset: str, file: Path | None, settings: list[str] | None, seed: int | None, schedule: str | None
+    preset: str,
+    layout: str,
+    file: Path | None,
+    settings: list[str] | None,
+    seed: int | None,
+    schedule: str | None,
 ) -> configuration.Config:
-    """Preset, then file, then single settings, then seed and schedule. Raises InputError."""
-    resolved = configuration.load_preset(preset)
+    """Preset, what the layout asks for, then file, then single settings, then seed and schedule. Raises InputError."""
+    resolved = configuration.for_layout(configuration.load_preset(preset), layout)
     if file is not None:
         resolved = configuration.load_config(file, resolved)
     direct = [f"{k}={v}" for k, v in (("seed", seed), ("schedule", schedule)) if v is not None]

@@ -71,11 +71,13 @@ class LossWeights:
 class TrackingConfig:
     """Pose of each frame against the fixed map.
 
-    ``adam`` is the paper's: the learning rates and loss weights. ``lm`` is ours: the fields from kernels_m to
+    ``adam`` is the paper's: the learning rates and loss weights; with ``warm_start`` (ours) it begins where a direct
+    alignment ends. ``lm`` is ours: the fields from kernels_m to
     colour_kernel, see ``AlignSettings``.
     """
 
     method: Literal["adam", "lm"] = "adam"
+    warm_start: bool = True
     iterations: int = _number(8, 1, 500)
     rays: int = _number(1000, 16, 200_000)
     lr_rotation: float = _number(1e-3, 0.0, 1.0)
@@ -96,11 +98,11 @@ class MappingConfig:
     first_iterations: int = _number(200, 1, 100_000)
     iterations: int = _number(10, 0, 10_000)
     rays: int = _number(2000, 16, 1_000_000)
-    newest_share: float = _number(0.3, 0.0, 1.0)
+    newest_share: float = _number(0.2, 0.0, 1.0)
     lr_grid: float = _number(1e-2, 0.0, 1.0)
     lr_decoder: float = _number(1e-2, 0.0, 1.0)
-    lr_rotation: float = _number(1e-3, 0.0, 1.0)
-    lr_translation: float = _number(1e-3, 0.0, 1.0)
+    lr_rotation: float = _number(3e-4, 0.0, 1.0)
+    lr_translation: float = _number(3e-4, 0.0, 1.0)
     loss: LossWeights = LossWeights()
     smooth_weight: float = _number(1e-6, 0.0)
     smooth_points: int = _number(32, 2, 256)
@@ -202,6 +204,12 @@ def load_preset(name: str) -> Config:
             f"preset {name!r}: no such preset{_suggest(name, preset_names())}; there are: {', '.join(preset_names())}"
         )
     return apply(Config(preset=name), parse_yaml(path.read_text("utf-8"), str(path)) or {}, str(path))
+
+
+def for_layout(config: Config, layout: str) -> Config:
+    """The configuration with what a data-set layout asks for (``configs/layouts/LAYOUT.yaml``, if there is one)."""
+    path = config_folder() / "layouts" / f"{layout}.yaml"
+    return apply(config, parse_yaml(path.read_text("utf-8"), str(path)), str(path)) if path.is_file() else config
 
 
 def load_config(path: Path, base: Config | None = None) -> Config:

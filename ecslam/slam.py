@@ -172,6 +172,8 @@ class Slam:
     def _track_from(self, field: TsdfField, pixels: Pixels, guess: NDArray[np.float64]) -> TrackResult:
         if self.config.tracking.method == "lm":
             return track_direct(field, self._kernels, pixels, guess, self.config)
+        if self.config.tracking.warm_start:
+            guess = track_direct(field, self._kernels, pixels, guess, self.config).c2w
         return track_adam(field, self._kernels, pixels, guess, self.config, self._generator)
 
     def _relocalise(self, field: TsdfField, frame: Frame, pixels: Pixels) -> TrackResult:
