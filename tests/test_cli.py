@@ -16,7 +16,7 @@ import torch
 
 from ecslam import cli
 from ecslam.commands import draw_picture
-from ecslam.config import load_config, load_preset
+from ecslam.config import apply_settings, load_config, load_preset
 from ecslam.datasets.meshes import load_mesh
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.types import Mesh
@@ -134,7 +134,7 @@ def test_run_folder_is_complete(finished):
 
 def test_saved_configuration_is_the_one_that_ran(finished):
     saved = load_config(finished / "config.yaml")
-    assert saved == cli.resolve_config("lite", None, [f"{k}={v}" for k, v in SETTINGS.items()], 3, None)
+    assert saved == apply_settings(load_preset("lite"), ["seed=3", *(f"{k}={v}" for k, v in SETTINGS.items())])
     assert saved != load_preset("lite")
 
 

@@ -169,7 +169,7 @@ def test_the_wheel_holds_the_presets_and_owns_no_bare_name(tmp_path):
     subprocess.run([sys.executable, "-m", "pip", "wheel", *options, str(source)], check=True)
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {f"ecslam/configs/{p.name}" for p in (ROOT / "configs").glob("*.yaml")} <= names
+    assert {f"ecslam/{p.relative_to(ROOT)}" for p in (ROOT / "configs").rglob("*.yaml")} <= names
     assert {m.replace(".", "/") + ".py" for m, p in MODULES.items() if p.name != "__init__.py"} <= names
     top = {name.split("/")[0] for name in names}
     assert {name for name in top if not name.endswith(".dist-info")} == {"ecslam", "ecslam_app"}

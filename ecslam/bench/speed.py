@@ -19,10 +19,12 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from ..config import Config, load_config, load_preset
+from ..config import Config, for_layout, load_config, load_preset
+from ..datasets import open_sequence, select_frames
 from ..runtime.checkpoint import load_checkpoint
 from ..runtime.engine import Engine
 from ..runtime.tally import peak_memory_mb
+from ..types import Sequence
 from .peer import measure_open3d, open3d_missing
 
 SPAN = 200
@@ -54,8 +56,9 @@ def bench_speed(
     medians of what ``measure`` gives; under ``peer`` the rival's (None without it, ``peer_note`` says why); under
     ``ratio`` wall-clock frames/s over the rival's. Raises InputError for a preset or a sequence that cannot be used.
     """
+    opened = select_frames(open_sequence(sequence), frames)
     for preset in presets:
-        _config(preset)
+        _config(preset, opened)
     note = open3d_missing() if peer else ""
     jobs: dict[str, tuple[Callable[..., Figures], tuple[str, ...]]] = {
         preset: (measure, (sequence, preset, frames, device)) for preset in presets
@@ -93,9 +96,10 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
     keyframe_growth_mb (what the keyframes stored in between weigh). Raises InputError.
     """
     memory: dict[int, float] = {}
+    opened = open_sequence(sequence)
     with tempfile.TemporaryDirectory(prefix="ecslam-bench-") as parent:
         folder = Path(parent) / "run"
-        engine = Engine(_config(preset), sequence, folder, device=device, frames=frames)
+        engine = Engine(_config(preset, opened), opened, folder, device=device, frames=frames)
         summary = engine.run(lambda snapshot: memory.update({snapshot.frame: _resident_mb()}))
         lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
         arrays = load_checkpoint(folder / "checkpoints").arrays
@@ -152,8 +156,11 @@ def plot_speed(result: Figures, path: Path) -> None:
     figure.savefig(path, format="png")
 
 
-def _config(preset: str) -> Config:
-    return load_config(Path(preset)) if preset.endswith((".yaml", ".yml")) else load_preset(preset)
+def _config(preset: str, sequence: Sequence) -> Config:
+    """What ``ecslam run`` would use: with --config for a YAML file, else with --preset."""
+    if preset.endswith((".yaml", ".yml")):
+        return load_config(Path(preset), for_layout(load_preset(sequence.preset), sequence.layout))
+    return for_layout(load_preset(preset), sequence.layout)
 
 
 def _in_own_process(job: Callable[..., Figures], arguments: tuple[str, ...]) -> Figures:
