@@ -131,7 +131,7 @@ class Mapper:
         self._optimiser.load_state_dict({"state": moments, "param_groups": groups})
 
     def _pick(self, views: Sequence[Pixels], rays: int, newest_share: float) -> list[NDArray[np.int64]]:
-        """The newest view gets ``newest_share`` of the rays (or an equal share if that is more), the others the rest."""
+        """The newest view gets ``newest_share`` of the rays (an equal share if that is more), the others the rest."""
         newest = max(round(rays * newest_share), -(-rays // len(views)))
         older = -(-(rays - newest) // max(len(views) - 1, 1))
         counts = [older] * (len(views) - 1) + [newest]

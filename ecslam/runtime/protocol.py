@@ -35,13 +35,19 @@ class EngineHandle(Protocol):
     """
 
     @property
-    def sequences(self) -> tuple[str, ...]: ...
+    def sequences(self) -> tuple[str, ...]:
+        """Addresses that ``Restart`` accepts."""
+        ...
 
     @property
-    def presets(self) -> tuple[str, ...]: ...
+    def presets(self) -> tuple[str, ...]:
+        """Names that ``Restart`` and ``LoadPreset`` accept."""
+        ...
 
     @property
-    def run_folder(self) -> Path: ...
+    def run_folder(self) -> Path:
+        """Where the run writes."""
+        ...
 
     def submit(self, command: Command) -> int:
         """Queue a command and return its id, which the ``Ack`` will carry. Never blocks; callable from any thread."""
