@@ -23,14 +23,10 @@ DAMPING = (1e-4, 1e-8, 1e4)
 
 @dataclass(frozen=True)
 class Alignment:
-    """c2w: float64 [4, 4]. cost: robust objective per point, in squared metres; inliers: share of all points with
-    weight above one half; condition: smallest over largest eigenvalue of the normal equations (0 = unconstrained)."""
+    """c2w: float64 [4, 4]. cost: robust objective per point, in squared metres."""
 
     c2w: NDArray[np.float64]
     cost: float
-    inliers: float
-    condition: float
-    steps: int
 
 
 def align(
@@ -47,7 +43,7 @@ def align(
     Coarse to fine through ``stages``, at most ``iterations`` steps in each.
     """
     c2w = torch.from_numpy(guess)
-    total, steps = len(points), 0
+    total = len(points)
     equations, stage = None, stages[0]
     for stage in stages:
         equations = _evaluate(field, kernels, c2w, points, luminance, stage)
@@ -57,7 +53,6 @@ def align(
                 break
             diagonal = torch.diag(equations.jtj.diagonal() + 1e-9)
             move = -torch.linalg.solve(equations.jtj + damping * diagonal, equations.jtr)
-            steps += 1
             trial = se3.retract(c2w, move)
             found = _evaluate(field, kernels, trial, points, luminance, stage)
             before, after = _objective(equations, total, stage), _objective(found, total, stage)
@@ -70,13 +65,7 @@ def align(
                 if damping > DAMPING[2] or float(move.abs().max()) < 1e-6:
                     break
     assert equations is not None
-    return Alignment(
-        c2w.numpy(),
-        _objective(equations, total, stage) / max(total, 1),
-        equations.inliers / max(total, 1),
-        _condition(equations.jtj),
-        steps,
-    )
+    return Alignment(c2w.numpy(), _objective(equations, total, stage) / max(total, 1))
 
 
 def _evaluate(
@@ -92,8 +81,3 @@ def _objective(equations: NormalEquations, total: int, settings: AlignSettings) 
     if settings.colour_weight > 0:
         worst += (settings.colour_weight * settings.colour_kernel) ** 2
     return equations.cost + 0.5 * worst * (total - equations.used)
-
-
-def _condition(jtj: Tensor) -> float:
-    values = torch.linalg.eigvalsh(jtj)
-    return float(values[0] / values[-1].clamp_min(1e-12))

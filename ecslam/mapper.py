@@ -72,7 +72,7 @@ class Mapper:
     ) -> MapResult:
         """Optimise the map and the poses c2w [W, 4, 4] of the views where not ``fixed`` [W].
 
-        The rays of all iterations are drawn at once; every iteration transforms its share by the current poses.
+        Every iteration draws its rays from the stored pixels and transforms them by the current poses.
         """
         m, field, device = config.mapping, self.field, self.field.device
         poses = PoseAdam(torch.from_numpy(c2w).to(device), m.lr_rotation, m.lr_translation)

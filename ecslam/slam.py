@@ -304,6 +304,7 @@ class Slam:
             **prefixed("mapper", self.mapper.state()),
             **prefixed("random", pack_random(self._rng, self._generator)),
             "bounds": np.zeros((0, 3)) if self._bounds is None else self._bounds,
+            "observed": self._observed.keys,
             "inside_loop": np.array(self._loops.inside),
             "lost": np.array([self._recovery.lost, self._recovery.misses]),
         }
@@ -320,6 +321,7 @@ class Slam:
         self.mapper = Mapper.restore(part("mapper", state), self._kernels, config, self.device)
         self._frozen = self._tracking_field()
         unpack_random(part("random", state), self._rng, self._generator)
+        self._observed.keys = np.array(state["observed"], np.int64)
         self._loops.inside = bool(state["inside_loop"])
         self._recovery.lost, self._recovery.misses = bool(state["lost"][0]), int(state["lost"][1])
         return self
