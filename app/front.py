@@ -26,12 +26,12 @@ from urllib.parse import parse_qs, urlsplit
 
 import viser
 import websockets.asyncio.server
-import websockets.exceptions
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from ecslam.types import InputError
 
+from .broadcast import share_batches
 from .guard import make_check
 from .page import index_page
 
@@ -119,6 +119,7 @@ def open_viser(listener: socket.socket, host: str, token: str | None, label: str
     names = None if host in ("0.0.0.0", "::", "") else _LOOPBACK_NAMES | {host.lower()}
     door = Door(names, token, f"ecslam_{port}")
     shell = _Shell(door, listener)
+    share_batches()
     with _construction, _serving_through(shell), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     if not shell.serving:
@@ -196,11 +197,11 @@ class _Guarded:
                 return raw
 
     async def send(self, data: bytes) -> None:
+        alarm = asyncio.get_running_loop().call_later(STALL_S, self._connection.transport.abort)
         try:
-            await asyncio.wait_for(self._connection.send(data), STALL_S)
-        except asyncio.TimeoutError:
-            self._connection.transport.abort()
-            raise websockets.exceptions.ConnectionClosedError(None, None) from None
+            await self._connection.send(data)
+        finally:
+            alarm.cancel()
 
     async def _pace(self) -> None:
         now = time.monotonic()

@@ -69,7 +69,10 @@ def to_glb(mesh: Mesh, colors: NDArray[np.uint8], wireframe: bool = False) -> by
     rgba = np.full((len(mesh.vertices), 4), 65535, np.uint16)
     rgba[:, :3] = _SRGB_TO_LINEAR16[colors]
     position = np.ascontiguousarray(mesh.vertices, np.float32)
-    parts = [position.tobytes(), rgba.tobytes(), np.ascontiguousarray(index, np.uint32).tobytes()]
+    small = len(position) <= 65535  # 65535 itself means "start again" to a GPU
+    index_type = _UINT16 if small else _UINT32
+    parts = [position.tobytes(), rgba.tobytes(), index.astype(np.uint16 if small else np.uint32).tobytes()]
+    parts[-1] += bytes(-len(parts[-1]) % 4)
     offsets = np.cumsum([0, *map(len, parts)]).tolist()
     low, high = position.min(0).tolist(), position.max(0).tolist()
     document = {
@@ -106,7 +109,12 @@ def to_glb(mesh: Mesh, colors: NDArray[np.uint8], wireframe: bool = False) -> by
                 "max": high,
             },
             {"bufferView": 1, "componentType": _UINT16, "count": len(rgba), "type": "VEC4", "normalized": True},
-            {"bufferView": 2, "componentType": _UINT32, "count": int(index.size), "type": "SCALAR"},
+            {
+                "bufferView": 2,
+                "componentType": index_type,
+                "count": int(index.size),
+                "type": "SCALAR",
+            },
         ],
     }
     text = json.dumps(document, separators=(",", ":")).encode()

@@ -28,12 +28,10 @@ from ecslam.messages import (
     Notice,
     RequestMesh,
     Snapshot,
-    State,
 )
 from ecslam.runtime.protocol import EngineHandle
 
 from . import theme
-from .glb import TRIANGLE_BUDGET
 from .history import History
 from .panel import TABS, BasePanel, find_panels
 from .replay import ReplayEngine
@@ -41,9 +39,8 @@ from .scene import Scene
 
 log = logging.getLogger(__name__)
 
-# viser packs every message once per viewer, so more viewers get fewer updates and the engine keeps its pace.
-REFRESH_S, REFRESH_PER_VIEWER_S = 0.12, 0.02
-MESH_EVERY_S, MESH_PER_VIEWER_S = 1.5, 0.25
+# Every viewer's socket must be written to, so more viewers get fewer updates and the engine keeps its pace.
+REFRESH_S, REFRESH_PER_VIEWER_S = 0.12, 0.01
 TOAST_CHARACTERS, NOTICE_EVERY_S = 240, 2.0
 DOWNLOAD_LIMIT = 256 * 1024 * 1024
 
@@ -58,7 +55,6 @@ class Hub:
         self.history = History() if self.replay is None else self.replay.history
         self.current: Snapshot | None = None
         self.follow = False
-        self.mesh_voxel_m, self.mesh_wanted = 0.04, True
         self.jobs = ThreadPoolExecutor(2, "dashboard-job")
         self._askers: dict[int, viser.ClientHandle] = {}
         self._asking = threading.Lock()
@@ -66,7 +62,6 @@ class Hub:
         self._subscription = engine.subscribe()
         self._newest: Snapshot | None = None
         self._newest_lock = threading.Lock()
-        self._mesh_asked, self._mesh_pending, self._mesh_frame = 0.0, False, -1
         self._seen_mesh = False
         self._noticed = 0.0
         self._closing = False
@@ -92,6 +87,8 @@ class Hub:
         latest = self.engine.latest()
         if latest is not None:
             self._take(latest)
+        if self.replay is not None:
+            self.submit(RequestMesh(0.0))
         for thread in self._threads:
             thread.start()
 
@@ -169,10 +166,6 @@ class Hub:
         client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
         self.toast("Saved", text, "green", client)
 
-    def remesh(self) -> None:
-        """Ask for a fresh mesh at the next chance, whatever the clock says."""
-        self._mesh_asked, self._mesh_frame = 0.0, -1
-
     # ---- the two threads -----------------------------------------------------------------------------------------
 
     def _listen(self) -> None:
@@ -228,35 +221,27 @@ class Hub:
         if before is None or restarted or before.sequence != s.sequence:
             self._begin(s)
         self.history.add_snapshot(s)
-        self.scene.update(s)
-        for panel in self.panels:
-            panel.snapshot(s)
+        with self.server.atomic():
+            self.scene.update(s)
+            for panel in self.panels:
+                panel.snapshot(s)
         if self.follow and len(s.trajectory):
             for client in self.viewers():
                 self.scene.follow(client, s.trajectory[-1])
-        self._want_mesh(s)
 
     def _begin(self, s: Snapshot) -> None:
         if self.replay is None:
             self.history = History()
         self.scene.begin(s)
-        self._seen_mesh, self._mesh_frame = False, -1
+        self._seen_mesh = False
         for client in self.viewers():
             self.scene.show_all(client, 0.0)
-
-    def _want_mesh(self, s: Snapshot) -> None:
-        now, period = time.monotonic(), MESH_EVERY_S + MESH_PER_VIEWER_S * len(self.server.get_clients())
-        due = now - self._mesh_asked > (period if not self._mesh_pending else 20.0)
-        if self.mesh_wanted and due and s.frame != self._mesh_frame and s.state not in (State.IDLE, State.FAILED):
-            self._mesh_asked, self._mesh_pending, self._mesh_frame = now, True, s.frame
-            self.submit(RequestMesh(self.mesh_voxel_m, TRIANGLE_BUDGET))
 
     def _tell(self, message: Event | Ack) -> None:
         if isinstance(message, Ack):
             self._acknowledged(message)
             return
         if isinstance(message, MeshReady):
-            self._mesh_pending = False
             self.scene.set_mesh(message)
             if not self._seen_mesh:
                 self._seen_mesh = True
@@ -284,8 +269,6 @@ class Hub:
             asker = None if waits else self._askers.pop(ack.command_id, None)
         if ack.error:
             self.toast("Not done", ack.error, "red", asker)
-            if isinstance(ack.command, RequestMesh):
-                self._mesh_pending = False
         for panel in self.panels:
             panel.ack(ack)
 

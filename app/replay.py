@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from ecslam.messages import (
     Export,
     Exported,
     MeshReady,
+    Notice,
     Pause,
     Quit,
     RequestMesh,
@@ -33,7 +35,8 @@ from ecslam.runtime.feed import Feed, FeedSubscription
 from ecslam.types import InputError
 
 from .history import FIGURES, History
-from .runs import Run, kitti_lines, load_mesh, tum_lines
+from .past import Past
+from .runs import Run, drawable_mesh, kitti_lines, load_mesh, tum_lines
 
 FRAMES_PER_S = 20.0
 
@@ -48,9 +51,11 @@ class ReplayEngine:
         self.run_folder = run.folder
         self.sequences = (str(run.summary.get("sequence", run.name)),)
         self.history = run_history(run)
+        self._past = Past(run.rows, run.trajectory)
         self._frame, self._playing, self._period = len(run.rows) - 1, False, 1 / FRAMES_PER_S
         self._inbox: queue.SimpleQueue[tuple[int, Command] | None] = queue.SimpleQueue()
         self._ids, self._lock = 0, threading.Lock()
+        self._shown_mesh: Path | None = None
         self._feed = Feed()
         self._feed.publish(self._snapshot())
         self._thread = threading.Thread(target=self._work, name="replay", daemon=True)
@@ -81,6 +86,8 @@ class ReplayEngine:
     def _work(self) -> None:
         due = 0.0
         while True:
+            if self._inbox.empty():
+                self._show_mesh()
             try:
                 wait = max(0.0, due - time.monotonic()) if self._playing else None
                 item = self._inbox.get(timeout=wait)
@@ -114,16 +121,23 @@ class ReplayEngine:
         elif isinstance(command, SpeedLimit):
             self._period = 1 / (command.frames_per_s or FRAMES_PER_S)
         elif isinstance(command, RequestMesh):
-            path = self.run.mesh_at(self._row_frame())
-            if path is not None:
-                self._feed.publish(MeshReady(self._row_frame(), command.voxel_m, load_mesh(path)))
+            self._shown_mesh = None
         elif isinstance(command, Export):
             self._feed.publish(Exported(command.kind, str(export(self.run, command)), number))
         elif not isinstance(command, RequestPictures):
             raise InputError(f"{type(command).__name__}: a finished run cannot do that; start one with `ecslam run`")
 
-    def _row_frame(self) -> int:
-        return int(self.run.rows[self._frame]["frame"])
+    def _show_mesh(self) -> None:
+        """Publish the mesh of the frame on show, if it is not the one that was published last."""
+        frame = int(self.run.rows[self._frame]["frame"])
+        path = self.run.mesh_at(frame)
+        if path is None or path == self._shown_mesh or not self._feed.watched:
+            return
+        self._shown_mesh = path
+        try:
+            self._feed.publish(MeshReady(frame, 0.0, drawable_mesh(path)))
+        except InputError as error:
+            self._feed.publish(Notice("warning", str(error), frame))
 
     def _go_to(self, frame: int) -> None:
         last = len(self.run.rows) - 1
@@ -135,7 +149,10 @@ class ReplayEngine:
         run, i = self.run, self._frame
         row, frame = run.rows[i], int(run.rows[i]["frame"])
         state = State.TRACKING if self._playing else State.FINISHED if i == len(run.rows) - 1 else State.PAUSED
-        keyframes = tuple(k for k in run.keyframes if k.frame <= frame)
+        trajectory = self._past.trajectory(i)
+        keyframes = tuple(
+            replace(k, c2w=trajectory[at]) for k, at in zip(run.keyframes, self._past.keyframes, strict=True) if at <= i
+        )
         thumbnail = keyframes[-1].thumbnail if keyframes and keyframes[-1].thumbnail.any() else None
         return Snapshot(
             state=state,
@@ -143,7 +160,7 @@ class ReplayEngine:
             preset=str(run.summary.get("preset", "")),
             frame=i,
             frames_total=len(run.rows),
-            trajectory=run.trajectory[: i + 1],
+            trajectory=trajectory,
             trajectory_gt=run.trajectory_gt,
             keyframes=keyframes,
             window=tuple(row.get("window") or self.history.window_at(frame)),

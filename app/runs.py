@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ecslam.messages import KeyframeView, LoopEvent
 from ecslam.types import InputError, Mesh
 
 from .geometry import wxyz
+from .glb import simplify
 
 Array = NDArray[np.float64]
 _NO_PICTURE = np.zeros((3, 4, 3), np.uint8)
@@ -91,6 +93,12 @@ def load_mesh(path: Path) -> Mesh:
     coloured = loaded.visual is not None and loaded.visual.kind == "vertex"
     colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(np.uint8) if coloured else None
     return Mesh(np.asarray(loaded.vertices, np.float32), np.asarray(loaded.faces, np.int32), colors)
+
+
+@lru_cache(12)
+def drawable_mesh(path: Path) -> Mesh:
+    """A mesh file within the triangle budget; remembered, as scrubbing comes back to it. Raises InputError."""
+    return simplify(load_mesh(path))
 
 
 def tum_lines(timestamps: Array, c2w: Array) -> str:

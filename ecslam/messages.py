@@ -235,7 +235,7 @@ class PauseOnLoop:
 
 @dataclass(frozen=True)
 class RequestMesh:
-    """Make a mesh now; the answer is a ``MeshReady``. max_triangles 0 = no limit."""
+    """Make a mesh now, and later ones no finer; the answer is a ``MeshReady``. max_triangles 0 = no limit."""
 
     voxel_m: float
     max_triangles: int = 0

@@ -16,6 +16,7 @@ from ecslam.runtime.feed import Feed
 from ecslam.types import InputError, Mesh
 
 FOV, ASPECT = 0.9, 4 / 3
+MESH_EVERY = 15
 
 
 def room_mesh(step: float = 0.08) -> Mesh:
@@ -149,6 +150,8 @@ class FakeEngine:
     def _advance(self):
         self._frame += 1
         i = self._frame
+        if i % MESH_EVERY == 0:
+            self._show_mesh(0.04)
         self._state = m.State.MAPPING if i % 5 == 0 else m.State.TRACKING
         if i == int(0.9 * self.frames):
             before = self._estimate(i)[:, :3, 3].astype(np.float32)
@@ -231,9 +234,7 @@ class FakeEngine:
                 self._preset = name
                 self.publish()
             case m.RequestMesh(voxel):
-                share = min(1.0, 0.25 + 0.75 * max(self._frame, 0) / self.frames)
-                faces = self._mesh.faces[: int(len(self._mesh.faces) * share)]
-                self._feed.publish(m.MeshReady(max(self._frame, 0), voxel, replace(self._mesh, faces=faces)))
+                self._show_mesh(voxel)
             case m.RequestPictures(frame):
                 at = self._frame if frame is None else frame
                 flat = [picture(at + k, 10 * k) for k in range(6)]
@@ -242,6 +243,11 @@ class FakeEngine:
                 self._feed.publish(m.Exported(kind, str(self._export(kind, form)), number))
             case _:
                 pass
+
+    def _show_mesh(self, voxel):
+        share = min(1.0, 0.25 + 0.75 * max(self._frame, 0) / self.frames)
+        faces = self._mesh.faces[: int(len(self._mesh.faces) * share)]
+        self._feed.publish(m.MeshReady(max(self._frame, 0), voxel, replace(self._mesh, faces=faces)))
 
     def _export(self, kind, form) -> Path:
         self.run_folder.mkdir(parents=True, exist_ok=True)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from html import escape
 
-from ecslam.messages import Snapshot
+from ecslam.messages import Event, MeshReady, RequestMesh, Snapshot
 
 from .. import theme
 from ..hub import Hub
 from ..panel import BasePanel
-from ..runs import Run, load_mesh
+from ..past import Past
+from ..runs import Run, drawable_mesh
 
 _FIGURES = (
     ("preset", "preset", None),
@@ -45,17 +46,18 @@ class Panel(BasePanel):
         gui.add_html(figures_table(self._run, self._other))
         gui.add_html(theme.legend([(self._run.name, theme.ESTIMATE), (self._other.name, theme.OTHER)]))
         self._shown = (self._run.name, self._other.name) if self._run.name != self._other.name else ("First", "Second")
-        mesh = gui.add_button_group("Mesh of", self._shown)
-        hub.on(mesh, lambda event: self._show_mesh(mesh.value == self._shown[1]))
+        self._mesh_of = gui.add_button_group("Mesh of", self._shown)
+        self._past = Past(self._other.rows, self._other.trajectory)
+        hub.on(self._mesh_of, lambda event: hub.submit(RequestMesh(0.0)))
 
     def snapshot(self, s: Snapshot) -> None:
-        self.hub.scene.compare(self._other.trajectory[: s.frame + 1, :3, 3])
+        self.hub.scene.compare(self._past.trajectory(min(s.frame, len(self._other.rows) - 1))[:, :3, 3])
 
-    def _show_mesh(self, other: bool) -> None:
-        run = self._other if other else self._run
-        path = run.mesh_at(int(run.rows[-1]["frame"]))
-        if path is not None:
-            self.hub.scene.show_mesh(load_mesh(path))
+    def event(self, event: Event) -> None:
+        """A mesh of the first run has come; show the second one's of that frame instead where it is wanted."""
+        path = self._other.mesh_at(event.frame) if isinstance(event, MeshReady) else None
+        if path is not None and self._mesh_of.value == self._shown[1]:
+            self.hub.scene.show_mesh(drawable_mesh(path))
 
 
 def figures_table(a: Run, b: Run) -> str:

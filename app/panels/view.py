@@ -7,7 +7,10 @@ from typing import Any
 
 import viser
 
+from ecslam.messages import RequestMesh
+
 from .. import theme
+from ..glb import TRIANGLE_BUDGET
 from ..hub import Hub
 from ..panel import BasePanel
 from ..scene import MESH_MODES
@@ -24,8 +27,15 @@ class Panel(BasePanel):
         mode = gui.add_button_group("Mesh", MESH_MODES)
         hub.on(mode, lambda event: self._set_mode(mode.value))
         if hub.replay is None:
-            detail = gui.add_slider("Mesh detail (cm)", 2.0, 12.0, 0.5, 100 * hub.mesh_voxel_m)
-            hub.on(detail, lambda event: self._set_detail(detail.value))
+            detail = gui.add_slider(
+                "Mesh detail (cm)",
+                2.0,
+                12.0,
+                0.5,
+                2.0,
+                hint="Finest voxel of the live mesh; exports have their own",
+            )
+            hub.on(detail, lambda event: hub.submit(RequestMesh(detail.value / 100, TRIANGLE_BUDGET), event.client))
         for label, group in (("Ground truth", "trajectory/ground truth"), ("Keyframes", "keyframes")):
             layer = gui.add_checkbox(label, True)
             hub.on(layer, partial(self._set_layer, group))
@@ -53,12 +63,7 @@ class Panel(BasePanel):
         self.hub.scene.set_visible(group, bool(event.target.value))
 
     def _set_mode(self, mode: str) -> None:
-        self.hub.mesh_wanted = mode != "Off"
         self.hub.scene.set_mode(mode)
-
-    def _set_detail(self, centimetres: float) -> None:
-        self.hub.mesh_voxel_m = centimetres / 100
-        self.hub.remesh()
 
     def _set_follow(self, on: bool) -> None:
         self.hub.follow = on

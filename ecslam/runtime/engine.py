@@ -40,8 +40,9 @@ class Engine:
     """An ``EngineHandle`` that runs ``Slam``.
 
     sequence: an opened one or an address for ``open_sequence``; frames: ``A:B:STEP``, "" = all. out: the run folder.
-    sequences: addresses that ``Restart`` may ask for. checkpoint_every: frames between checkpoints, a kill costs at
-    most twice as many. Raises InputError when the sequence cannot be opened or the folder not be written to.
+    sequences: addresses that ``Restart`` may ask for. checkpoint_every: fewest frames between checkpoints; what a kill
+    costs at most, see ``CheckpointWriter``. Raises InputError when the sequence cannot be opened or the folder not be
+    written to.
     """
 
     def __init__(
@@ -230,6 +231,7 @@ class Engine:
             run.clock.resume()
             if turn is Turn.PAUSED:
                 run.measure()
+                self._workshop.live(run, at_once=True)
                 self._show(State.PAUSED)
             elif turn is Turn.WORK:
                 self._work(run)

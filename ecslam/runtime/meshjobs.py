@@ -123,12 +123,17 @@ class LiveMeshes:
     def __init__(self) -> None:
         self._due = monotonic() + FIRST_AFTER_S
         self._voxel_m = FIRST_VOXEL_M
+        self._finest_m = FINEST_LIVE_VOXEL_M
         self._making = False
 
     @property
     def due(self) -> bool:
         """Whether to freeze the map now and ``make`` a mesh."""
         return not self._making and monotonic() >= self._due
+
+    def limit(self, finest_m: float) -> None:
+        """From now on use no finer voxel than this."""
+        self._finest_m = self._voxel_m = finest_m
 
     def begin(self) -> None:
         """A job that will call ``make`` has been queued."""
@@ -146,5 +151,5 @@ class LiveMeshes:
         faces = len(ready.mesh.faces)
         if not faces:
             return None
-        self._voxel_m = max(FINEST_LIVE_VOXEL_M, ready.voxel_m * float(np.sqrt(1.2 * faces / LIVE_TRIANGLES)))
+        self._voxel_m = max(self._finest_m, ready.voxel_m * float(np.sqrt(1.2 * faces / LIVE_TRIANGLES)))
         return ready

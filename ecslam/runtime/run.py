@@ -17,7 +17,8 @@ from ..evaluation.trajectory_io import format_tum
 from ..messages import Event, LoopEvent, Notice, StepReport
 from ..se3 import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
-from .checkpoint import Checkpoint, CheckpointWriter
+from .checkpoint import Checkpoint
+from .checkpoint_writer import CheckpointWriter
 from .driven import SlamFactory, SlamLike
 from .driven import State as Arrays
 from .meshjobs import FrozenMap
@@ -185,7 +186,7 @@ class Run:
         if report.is_keyframe:
             self.thumbnails[report.frame] = shrink(frame.color, THUMBNAIL_WIDTH)
             self.folder.keyframe(report.frame, report.c2w, self.thumbnails[report.frame])
-        self.folder.metrics(report, self.ate_cm.rmse if self.ate_cm else None)
+        self.folder.metrics(report, self.ate_cm.rmse if self.ate_cm else None, self._window_poses(report))
         if report.loop is not None:
             self.loops.append(report.loop)
             self.folder.event(report.loop)
@@ -238,12 +239,18 @@ class Run:
         poses, frames = self.poses(), self.tally.keyframes
         return frames, poses[np.searchsorted(self.tally.rows, frames)]
 
+    def _window_poses(self, report: StepReport) -> NDArray[np.float64]:
+        return self.poses()[np.searchsorted(self.tally.rows, report.window)] if report.window else np.empty((0, 4, 4))
+
     # ---- saving -----------------------------------------------------------------------------------------------------
 
     def checkpoint(self, finished: bool = False) -> None:
         """Start saving everything that ``resume`` needs."""
-        if self.slam is None or self.torn:
-            return
+        if self.slam is not None and not self.torn:
+            slam = self.slam
+            self._checkpoints.save(lambda: self._everything(slam, finished))
+
+    def _everything(self, slam: SlamLike, finished: bool) -> Checkpoint:
         self.tally.wall_s = self.clock.seconds
         meta = {
             "sequence": self.plan.address,
@@ -252,7 +259,7 @@ class Run:
             "tally": self.tally.to_json(),
             "finished": finished,
         }
-        self._checkpoints.save(Checkpoint(self.tally.position, self.slam.state(), meta))
+        return Checkpoint(self.tally.position, slam.state(), meta)
 
     def write_trajectory(self) -> None:
         """Bring ``trajectory.txt`` up to date."""

@@ -103,8 +103,8 @@ class RunFolder:
         """Note that ``name`` is saved after all."""
         self.not_saved.pop(name, None)
 
-    def metrics(self, report: StepReport, ate_cm: float | None) -> None:
-        """Log what a frame brought."""
+    def metrics(self, report: StepReport, ate_cm: float | None, window_c2w: NDArray[np.float64]) -> None:
+        """Log what a frame brought. window_c2w: poses [len(window), 4, 4] of the window's keyframes, which it moved."""
         line = {
             "frame": report.frame,
             "timestamp": report.timestamp,
@@ -113,6 +113,7 @@ class RunFolder:
             "lost": report.lost,
             "keyframe": report.is_keyframe,
             "window": report.window,
+            "window_c2w": window_c2w[:, :3].reshape(-1, 12).round(6),
             "losses": report.losses,
             "track_ms": report.track_ms,
             "map_ms": report.map_ms,

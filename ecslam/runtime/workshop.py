@@ -54,6 +54,7 @@ class Workshop:
                 if isinstance(command, RequestMesh) or (isinstance(command, Export) and command.kind == "mesh"):
                     frozen = frozen or _freeze(run)
                 if isinstance(command, RequestMesh):
+                    self._live.limit(command.voxel_m)
                     self._jobs.submit(self._mesh_job(_needed(frozen), command))
                 elif isinstance(command, Export):
                     self._jobs.submit(export_job(run, command, command_id, frozen, self._feed.publish, self._leaving))
