@@ -45,25 +45,19 @@ def unpack_field(arrays: Arrays, device: torch.device) -> TsdfField:
 
 
 def pack_keyframes(keyframes: list[Keyframe]) -> Arrays:
-    """All stored pixels end to end, with where each keyframe's begin."""
-    counts = np.array([len(k.pixels) for k in keyframes], np.int64)
-    out: Arrays = {
-        "frame": np.array([k.frame for k in keyframes], np.int64),
-        "count": counts,
-        "thumbnail": np.stack([k.thumbnail for k in keyframes]),
-    }
-    for f in fields(Pixels):
-        out[f.name] = np.concatenate([getattr(k.pixels, f.name) for k in keyframes])
+    """Under ``FRAME.`` the arrays of each keyframe, not copied: they never change."""
+    out: Arrays = {}
+    for k in keyframes:
+        out[f"{k.frame}.thumbnail"] = k.thumbnail
+        out |= {f"{k.frame}.{f.name}": getattr(k.pixels, f.name) for f in fields(Pixels)}
     return out
 
 
 def unpack_keyframes(arrays: Arrays) -> list[Keyframe]:
-    """The inverse of ``pack_keyframes``."""
-    ends = np.cumsum(arrays["count"])
-    columns = [np.split(arrays[f.name], ends[:-1]) for f in fields(Pixels)]
+    """The inverse of ``pack_keyframes``, in the order of frames."""
     return [
-        Keyframe(int(frame), Pixels(*pixels), thumbnail)
-        for frame, thumbnail, *pixels in zip(arrays["frame"], arrays["thumbnail"], *columns, strict=True)
+        Keyframe(i, Pixels(*(arrays[f"{i}.{f.name}"] for f in fields(Pixels))), arrays[f"{i}.thumbnail"])
+        for i in sorted({int(name.partition(".")[0]) for name in arrays})
     ]
 
 

@@ -1,14 +1,16 @@
 """Checkpoints: round trip, two generations, every kind of damage falls back or is refused, nothing half-written."""
 
 import errno
+import json
 import os
 import threading
 
 import numpy as np
 import pytest
 
-from ecslam.runtime import checkpoint as module
-from ecslam.runtime.checkpoint import Checkpoint, CheckpointWriter, load_checkpoint, save_checkpoint
+from ecslam.runtime import checkpoint_writer as module
+from ecslam.runtime.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from ecslam.runtime.checkpoint_writer import CheckpointWriter
 from ecslam.types import InputError
 
 ARRAYS = {
@@ -38,8 +40,29 @@ def test_the_newest_two_generations_are_kept(tmp_path):
     for frame in (5, 10, 15, 20):
         save_checkpoint(tmp_path, checkpoint(frame))
         assert load_checkpoint(tmp_path).frame == frame
-    names = sorted(os.listdir(tmp_path))
-    assert names == ["000015.json", "000015.safetensors", "000020.json", "000020.safetensors"]
+    assert sorted(p.name for p in tmp_path.glob("*.json")) == ["000015.json", "000020.json"]
+    assert len(list(tmp_path.glob("*.safetensors"))) == 2
+
+
+def test_lasting_arrays_are_written_once_and_changing_ones_every_time(tmp_path):
+    pictures = {f"keyframes.{i}.color": np.full(10_000, i, np.uint8) for i in range(4)}
+    stored, written = None, {}
+    for frame in range(1, 5):
+        known = dict(list(pictures.items())[:frame])
+        stored = save_checkpoint(tmp_path, Checkpoint(frame, {"map": np.full(3, frame)} | known), stored)
+        sizes = {p.name: p.stat().st_size for p in tmp_path.glob("*.safetensors")}
+        assert sum(size for name, size in sizes.items() if name not in written) < 12_000
+        written |= sizes
+    back = load_checkpoint(tmp_path).arrays
+    assert back["map"].tolist() == [4, 4, 4]
+    assert all(np.array_equal(back[name], value) for name, value in pictures.items())
+    assert len(list(tmp_path.glob("*.safetensors"))) == 4 + 2
+
+
+def test_a_lasting_array_that_did_change_is_written_again(tmp_path):
+    stored = save_checkpoint(tmp_path, Checkpoint(1, {"keyframes.0.color": np.zeros(3)}))
+    save_checkpoint(tmp_path, Checkpoint(2, {"keyframes.0.color": np.ones(3)}), stored)
+    assert load_checkpoint(tmp_path).arrays["keyframes.0.color"].tolist() == [1, 1, 1]
 
 
 def flip(path, position):
@@ -48,15 +71,21 @@ def flip(path, position):
     path.write_bytes(data)
 
 
+def arrays_of(folder, frame):
+    """The newest file of arrays of a generation."""
+    digest = json.loads(json.loads((folder / f"{frame:06d}.json").read_text())["body"])["files"][-1]
+    return folder / f"{digest[:16]}.safetensors"
+
+
 DAMAGE = {
-    "flipped array": lambda folder: flip(folder / "000010.safetensors", -3),
-    "flipped header": lambda folder: flip(folder / "000010.safetensors", 12),
+    "flipped array": lambda folder: flip(arrays_of(folder, 10), -3),
+    "flipped header": lambda folder: flip(arrays_of(folder, 10), 12),
     "flipped manifest": lambda folder: flip(folder / "000010.json", 200),
-    "truncated arrays": lambda folder: os.truncate(folder / "000010.safetensors", 50),
+    "truncated arrays": lambda folder: os.truncate(arrays_of(folder, 10), 50),
     "empty manifest": lambda folder: os.truncate(folder / "000010.json", 0),
-    "missing arrays": lambda folder: (folder / "000010.safetensors").unlink(),
+    "missing arrays": lambda folder: arrays_of(folder, 10).unlink(),
     "other json": lambda folder: (folder / "000010.json").write_text("[1, 2]"),
-    "pickle": lambda folder: (folder / "000010.safetensors").write_bytes(b"\x80\x04cos\nsystem\n"),
+    "pickle": lambda folder: arrays_of(folder, 10).write_bytes(b"\x80\x04cos\nsystem\n"),
     "huge manifest": lambda folder: os.truncate(folder / "000010.json", 1 << 30),
 }
 
@@ -67,6 +96,8 @@ def test_a_damaged_newest_generation_falls_back_to_the_older(tmp_path, damage):
     save_checkpoint(tmp_path, checkpoint(10))
     damage(tmp_path)
     assert load_checkpoint(tmp_path).frame == 5
+    save_checkpoint(tmp_path, checkpoint(15))
+    assert load_checkpoint(tmp_path).frame == 15
 
 
 def test_every_flipped_byte_of_the_manifest_is_noticed(tmp_path):
@@ -86,7 +117,7 @@ def test_no_whole_generation_is_one_clear_line(tmp_path):
         load_checkpoint(tmp_path / "nowhere")
     for frame in (5, 10):
         save_checkpoint(tmp_path, checkpoint(frame))
-        flip(tmp_path / f"{frame:06d}.safetensors", -1)
+        flip(arrays_of(tmp_path, frame), -1)
     with pytest.raises(InputError, match=r"000010.json: the arrays do not match.*000005.json") as caught:
         load_checkpoint(tmp_path)
     assert "\n" not in str(caught.value)
@@ -95,7 +126,7 @@ def test_no_whole_generation_is_one_clear_line(tmp_path):
 def test_a_full_disk_is_reported_and_the_older_generations_stay(tmp_path, monkeypatch):
     failures, saved = [], []
     writer = CheckpointWriter(tmp_path, 5, failures.append, lambda: saved.append(1))
-    writer.save(checkpoint(5))
+    writer.save(lambda: checkpoint(5))
     writer.wait()
 
     def full(_):
@@ -103,11 +134,11 @@ def test_a_full_disk_is_reported_and_the_older_generations_stay(tmp_path, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        writer.save(checkpoint(10))
+        writer.save(lambda: checkpoint(10))
         writer.wait()
     assert [f.errno for f in failures] == [errno.ENOSPC]
     assert load_checkpoint(tmp_path).frame == 5
-    writer.save(checkpoint(15))
+    writer.save(lambda: checkpoint(15))
     writer.wait()
     assert load_checkpoint(tmp_path).frame == 15
     assert len(saved) == 2
@@ -126,13 +157,36 @@ def test_a_slow_disk_costs_at_most_twice_the_period_and_no_waiting_before(tmp_pa
     writer = CheckpointWriter(tmp_path, 5, print, lambda: None)
     assert writer.due(1)
     finish.set()
-    writer.save(checkpoint(1))
-    writer.wait()
-    assert [f for f in range(2, 7) if writer.due(f)] == [6]
+    saving(writer, 1, clock, 0.0)
     finish.clear()
-    writer.save(checkpoint(6))
-    assert [f for f in range(7, 12) if writer.due(f)] == [11]
+    clock.seconds += 1.0
+    writer.save(lambda: checkpoint(6))
+    assert [f for f in range(7, 20) if writer.due(f)] == []
+    clock.seconds += 2.0
+    assert [f for f in range(7, 14) if writer.due(f)] == [11, 12, 13]
     finish.set()
-    writer.save(checkpoint(11))
+    writer.save(lambda: checkpoint(11))
     writer.wait()
     assert load_checkpoint(tmp_path).frame == 11
+    saving(writer, 1, clock, 0.0)
+    clock.seconds += 1000
+    assert [f for f in range(2, 8) if writer.due(f)] == [6, 7]
+
+
+@pytest.mark.parametrize(("cost_s", "pause_s"), [(0.1, 2.0), (1.0, 3.0)])
+def test_saving_takes_a_twentieth_of_the_time_but_never_are_over_three_seconds_at_stake(tmp_path, cost_s, pause_s):
+    clock = Clock()
+    writer = CheckpointWriter(tmp_path, 5, print, lambda: None, now=clock)
+    began = clock.seconds
+    saving(writer, 1, clock, cost_s)
+    frame = 20
+    while not writer.due(frame):
+        clock.seconds += 0.01
+    assert clock.seconds - began == pytest.approx(pause_s, abs=0.02)
+
+
+def test_a_slow_disk_is_waited_for_after_ten_frames_and_three_seconds(tmp_path, monkeypatch):
+    finish, clock = threading.Event(), Clock()
+    real = module.save_checkpoint
+    monkeypatch.setattr(module, "save_checkpoint", lambda *args: (finish.wait(), real(*args))[1])
+    writer = CheckpointWriter(tmp_path, 5, print, lambda: None, now=clock)

@@ -21,10 +21,12 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from fake_slam import QUICK, Behaviour, FakeSequence, maker
+from ecslam.runtime import checkpoint_writer
 from ecslam.runtime.checkpoint import load_checkpoint
 from ecslam.runtime.engine import Engine
 from ecslam.runtime.signals import quit_on_signals
 
+checkpoint_writer.PATIENCE_S = 0.0  # quick frames are held to the promise for slow ones
 out, first, pause = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
 make = maker(Behaviour(first_interrupts=first, pause_s=pause))
 sequence = FakeSequence(100_000)

@@ -113,7 +113,7 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
         "track_ms": float(track.mean()) if len(track) else 0.0,
         "map_ms": float(mapped.mean()) if len(mapped) else 0.0,
         "stored_keyframes_mb": stored_mb,
-        **_growth(track + mapped, memory, arrays["keyframes.frame"], stored_mb),
+        **_growth(track + mapped, memory, np.array([i for i, line in enumerate(lines) if line["keyframe"]]), stored_mb),
         "cost_ms": (track + mapped).tolist(),
     }
 

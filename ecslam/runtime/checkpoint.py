@@ -1,15 +1,15 @@
 """Checkpoints: safetensors for arrays, JSON for the rest, sha256 over both, two generations; never pickle.
 
-``NNNNNN.safetensors`` is written first, then ``NNNNNN.json``, which names its digest and so commits it; generations
-older than the newest two are removed last. A kill at any moment leaves at least one whole generation.
+Arrays lie in files that are named by their digest, so none is ever overwritten. ``NNNNNN.json``, written last, names
+the files of a generation and so commits it; what the newest two generations do not name is removed after that. A kill
+at any moment leaves at least one whole generation. Arrays under ``LASTING`` never change once they are there: only
+those that no file holds yet are written, so a checkpoint costs what has changed, not what has been gathered so far.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,14 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from ..types import InputError
-from .files import remove_temporaries, to_json, write_atomic
+from .files import to_json, write_atomic
 
-VERSION = 1
+VERSION = 2
 GENERATIONS = 2
 MAX_MANIFEST_BYTES = 16 << 20
+LASTING = "keyframes."
+
+Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -32,32 +35,40 @@ class Checkpoint:
     """frame: frames of the sequence done so far. arrays: what ``Slam.state`` gave. meta: plain JSON values."""
 
     frame: int
-    arrays: dict[str, NDArray[Any]]
+    arrays: Arrays
     meta: dict[str, Any] = field(default_factory=dict)
 
 
-def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Write a generation and remove those older than the newest two. Raises OSError; earlier generations then stay."""
+@dataclass(frozen=True)
+class Stored:
+    """The lasting arrays that the newest generation holds, and the digests of their files, oldest first."""
+
+    arrays: Arrays = field(default_factory=dict)
+    files: tuple[str, ...] = ()
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint, stored: Stored | None = None) -> Stored:
+    """Write a generation and remove those older than the newest two. Raises OSError; earlier generations then stay.
+
+    stored: what the call before returned, None for everything anew. The result is for the next call.
+    """
     folder.mkdir(exist_ok=True)
-    stem = folder / f"{checkpoint.frame:06d}"
-    arrays = {name: np.require(value, requirements="C") for name, value in checkpoint.arrays.items()}
-    data = safetensors.numpy.save(arrays)
+    stored = stored or Stored()
+    lasting = {name: value for name, value in checkpoint.arrays.items() if name.startswith(LASTING)}
+    fresh = {name: value for name, value in lasting.items() if stored.arrays.get(name) is not value}
+    rest = {name: value for name, value in checkpoint.arrays.items() if name not in lasting}
+    files = (*stored.files, _write(folder, fresh)) if fresh else stored.files
     body = {
         "version": VERSION,
         "frame": checkpoint.frame,
-        "arrays_sha256": hashlib.sha256(data).hexdigest(),
+        "files": [*files, _write(folder, rest)],
         "meta": checkpoint.meta,
     }
     text = to_json(body)
     manifest = {"sha256": hashlib.sha256(text.encode()).hexdigest(), "body": text}
-    write_atomic(stem.with_suffix(".safetensors"), data)
-    write_atomic(stem.with_suffix(".json"), to_json(manifest).encode())
-    for old in _generations(folder)[GENERATIONS:]:
-        old.unlink(missing_ok=True)
-    keep = {path.stem for path in _generations(folder)}
-    for path in folder.glob("*.safetensors"):
-        if path.stem not in keep:
-            path.unlink(missing_ok=True)
+    write_atomic(folder / f"{checkpoint.frame:06d}.json", to_json(manifest).encode())
+    _clean(folder)
+    return Stored(lasting, files)
 
 
 def load_checkpoint(folder: Path) -> Checkpoint:
@@ -72,19 +83,39 @@ def load_checkpoint(folder: Path) -> Checkpoint:
     raise InputError(f"{folder}: no usable checkpoint ({found}); start the run again with ecslam run")
 
 
+def _write(folder: Path, arrays: Arrays) -> str:
+    """Save arrays in a file of their own; its digest."""
+    data = safetensors.numpy.save({name: np.require(value, requirements="C") for name, value in arrays.items()})
+    digest = hashlib.sha256(data).hexdigest()
+    write_atomic(_file(folder, digest), data)
+    return digest
+
+
+def _file(folder: Path, digest: str) -> Path:
+    return folder / f"{digest[:16]}.safetensors"
+
+
 def _load(path: Path) -> Checkpoint:
+    body = _read_body(path)
+    if body["version"] != VERSION:
+        raise ValueError(f"written by another version of ecslam (format {body['version']}, this one reads {VERSION})")
+    arrays: Arrays = {}
+    for digest in body["files"]:
+        data = _file(path.parent, digest).read_bytes()
+        if hashlib.sha256(data).hexdigest() != digest:
+            raise ValueError("the arrays do not match their checksum")
+        arrays |= safetensors.numpy.load(data)
+    return Checkpoint(body["frame"], arrays, body["meta"])
+
+
+def _read_body(path: Path) -> dict[str, Any]:
     if path.stat().st_size > MAX_MANIFEST_BYTES:
         raise ValueError("the manifest is too large")
     manifest = json.loads(path.read_text("utf-8"))
     if hashlib.sha256(manifest["body"].encode()).hexdigest() != manifest["sha256"]:
         raise ValueError("the manifest does not match its checksum")
-    body = json.loads(manifest["body"])
-    if body["version"] != VERSION:
-        raise ValueError(f"written by another version of ecslam (format {body['version']}, this one reads {VERSION})")
-    data = path.with_suffix(".safetensors").read_bytes()
-    if hashlib.sha256(data).hexdigest() != body["arrays_sha256"]:
-        raise ValueError("the arrays do not match their checksum")
-    return Checkpoint(body["frame"], safetensors.numpy.load(data), body["meta"])
+    body: dict[str, Any] = json.loads(manifest["body"])
+    return body
 
 
 def _generations(folder: Path) -> list[Path]:
@@ -92,46 +123,16 @@ def _generations(folder: Path) -> list[Path]:
     return sorted(folder.glob("[0-9]*.json"), reverse=True)
 
 
-class CheckpointWriter:
-    """Writes checkpoints in a thread of its own, at most one at a time, ``every`` so many frames.
-
-    A slow disk does not hold the run up before 2 ``every`` frames hang on the checkpoint being written, which is what a
-    kill costs at most. failed: called in the writer's thread with the OSError of a checkpoint that could not be saved;
-    saved: with none.
-    """
-
-    def __init__(
-        self, folder: Path, every: int, failed: Callable[[OSError], None], saved: Callable[[], None], frame: int = 0
-    ) -> None:
-        self._folder, self._every, self._failed, self._saved = folder, every, failed, saved
-        self._thread: threading.Thread | None = None
-        self._begun = self._settled = frame
-        if folder.is_dir():
-            remove_temporaries(folder)
-
-    def due(self, frame: int) -> bool:
-        """Whether the state after ``frame`` frames is to be saved; always after the first one, the most expensive."""
-        busy = self._thread is not None and self._thread.is_alive()
-        late = frame - self._settled >= 2 * self._every
-        return self._begun == 0 or (frame - self._begun >= self._every and (late or not busy))
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Start writing, after the one before is done. The arrays must not be written to afterwards."""
-        self.wait()
-        self._begun = checkpoint.frame
-        self._thread = threading.Thread(target=self._write, args=(checkpoint,), name="checkpoint", daemon=True)
-        self._thread.start()
-
-    def wait(self) -> None:
-        """Return when everything is on the disk, or reported as failed."""
-        if self._thread is not None:
-            self._thread.join()
-
-    def _write(self, checkpoint: Checkpoint) -> None:
+def _clean(folder: Path) -> None:
+    """Remove generations older than the newest two, and the arrays that none of these names."""
+    for old in _generations(folder)[GENERATIONS:]:
+        old.unlink(missing_ok=True)
+    named: set[Path] = set()
+    for path in _generations(folder):
         try:
-            save_checkpoint(self._folder, checkpoint)
-        except OSError as error:
-            self._failed(error)
-        else:
-            self._saved()
-        self._settled = checkpoint.frame
+            named.update(_file(folder, digest) for digest in _read_body(path)["files"])
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # damaged, so nothing can be loaded by it
+    for file in folder.glob("*.safetensors"):
+        if file not in named:
+            file.unlink(missing_ok=True)
