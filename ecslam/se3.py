@@ -7,10 +7,21 @@ about its optical centre and v moves the centre, so the two parts do not mix (wh
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from .rigid import inverse, orthonormalise, rotation_angle_deg
+
+__all__ = [
+    "inverse",
+    "orthonormalise",
+    "retract",
+    "rotation_angle_deg",
+    "skew",
+    "so3_exp",
+    "so3_log",
+    "tangent_gradient",
+]
 
 
 def skew(w: Tensor) -> Tensor:
@@ -69,31 +80,3 @@ def tangent_gradient(c2w: Tensor, gradient: Tensor) -> Tensor:
     m = g @ rotation.transpose(-1, -2)
     w = torch.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1)
     return torch.cat([gradient[..., :3, 3], w], -1)
-
-
-def inverse(c2w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of rigid 4x4 matrices [..., 4, 4]."""
-    rotation = np.swapaxes(c2w[..., :3, :3], -1, -2)
-    out = np.zeros_like(c2w)
-    out[..., :3, :3] = rotation
-    out[..., :3, 3] = -(rotation @ c2w[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1
-    return out
-
-
-def orthonormalise(c2w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The nearest rigid motion to [..., 4, 4] (removes the drift of repeated products)."""
-    u, _, vt = np.linalg.svd(c2w[..., :3, :3])
-    sign = np.ones(u.shape[:-1])
-    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
-    out = c2w.copy()
-    out[..., :3, :3] = (u * sign[..., None, :]) @ vt
-    return out
-
-
-def rotation_angle_deg(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angle in degrees between the rotations of poses [..., 4, 4]."""
-    r = np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]
-    axis = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1)
-    trace = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
-    return np.degrees(np.arctan2(0.5 * np.linalg.norm(axis, axis=-1), 0.5 * (trace - 1)))

@@ -17,6 +17,7 @@ else:
 ROOT = Path(__file__).parent.parent
 LAYERS = (
     ("types", "messages", "config"),
+    ("rigid",),
     ("se3",),
     ("kernels",),
     ("field",),

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ..types import Frame, FrameError, Intrinsics, Sequence
 from .prefetch import prefetch
@@ -153,6 +152,8 @@ def _read_frames(results: Iterator[Frame | FrameError]) -> tuple[DepthStats, int
 
 
 def _pose_stats(poses: NDArray[np.float64] | None) -> PoseStats | None:
+    from scipy.spatial.transform import Rotation
+
     if poses is None:
         return None
     good = finite_poses(poses)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from ..types import InputError, Intrinsics
 from .files import FileSequence
@@ -93,6 +92,11 @@ def interpolate_poses(
     Linear in position and slerp in rotation between two neighbours within ``limit`` seconds; else the nearest one
     within ``limit``; else NaN.
     """
+    from scipy.spatial.transform import (  # half a second to import, which other layouts need not wait for
+        Rotation,
+        Slerp,
+    )
+
     right = np.searchsorted(known, times).clip(0, len(known) - 1)
     left = np.where(known[right] > times, right - 1, right).clip(0)
     far_left, far_right = np.abs(known[left] - times) > limit, np.abs(known[right] - times) > limit

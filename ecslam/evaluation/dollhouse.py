@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.raster import rasterize
-from ..se3 import inverse
+from ..rigid import inverse
 from ..types import Intrinsics, Mesh
 from .surface import part
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..se3 import inverse, rotation_angle_deg
+from ..rigid import inverse, rotation_angle_deg
 
 Floats = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from ..rigid import orthonormalise, quaternions, rotations
 from ..types import InputError
 
 Floats = NDArray[np.float64]
@@ -21,8 +21,8 @@ def format_tum(timestamps: Floats, poses: Floats) -> str:
     ok = np.isfinite(poses).all((1, 2))
     if not ok.any():
         return ""
-    quaternions = Rotation.from_matrix(poses[ok, :3, :3]).as_quat(canonical=True)
-    rows = np.column_stack([np.asarray(timestamps, np.float64)[ok], poses[ok, :3, 3], quaternions])
+    turns = quaternions(orthonormalise(poses[ok])[:, :3, :3])
+    rows = np.column_stack([np.asarray(timestamps, np.float64)[ok], poses[ok, :3, 3], turns])
     return "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
 
 
@@ -53,7 +53,7 @@ def read_tum(path: Path) -> tuple[Floats, Floats]:
         raise InputError(f"{path}: no pose in it; expected lines of 'timestamp tx ty tz qx qy qz qw'")
     table = np.array(rows)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
+    poses[:, :3, :3] = rotations(table[:, 4:])
     poses[:, :3, 3] = table[:, 1:4]
     return table[:, 0], poses
 

@@ -15,7 +15,7 @@ from ..config import Config
 from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
 from ..messages import Event, LoopEvent, Notice, StepReport
-from ..se3 import rotation_angle_deg
+from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter

@@ -1,0 +1,36 @@
+"""Quaternions against SciPy's, everywhere and where single formulas break down."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ecslam.rigid import quaternions, rotations
+
+HALF_TURNS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -2, 3], [-1, 2, 2]])
+
+
+@given(st.lists(st.floats(-3.2, 3.2), min_size=3, max_size=3))
+def test_quaternions_are_those_of_scipy(turn):
+    matrix = Rotation.from_rotvec(turn).as_matrix()[None]
+    found = quaternions(matrix)
+    assert np.allclose(found @ Rotation.from_matrix(matrix).as_quat(canonical=True).T, 1, atol=1e-14)
+    assert found[0, 3] >= 0
+    assert np.allclose(rotations(found), matrix, atol=1e-14)
+
+
+@pytest.mark.parametrize("short_of_half", [0.0, 1e-9, 1e-4])
+def test_half_turns(short_of_half):
+    axis = HALF_TURNS / np.linalg.norm(HALF_TURNS, axis=1, keepdims=True)
+    matrix = Rotation.from_rotvec((np.pi - short_of_half) * axis).as_matrix()
+    assert np.allclose(rotations(quaternions(matrix)), matrix, atol=1e-14)
+
+
+def test_the_length_of_a_quaternion_does_not_matter():
+    turn = Rotation.from_euler("xyz", [[0.3, -1.0, 2.0]])
+    assert np.allclose(rotations(1.01 * turn.as_quat()), turn.as_matrix(), atol=1e-14)
+
+
+def test_none_is_none():
+    assert rotations(quaternions(np.empty((0, 3, 3)))).shape == (0, 3, 3)
