@@ -1,13 +1,14 @@
-"""Direct alignment: Levenberg-Marquardt on the TSDF itself, one sample per pixel at its measured depth (ours).
+"""Direct alignment: Levenberg-Marquardt on a signed distance itself, one sample per pixel at its measured depth (ours).
 
-A step costs one fused pass over the points instead of a rendering, so a frame needs milliseconds. Damping and step
-control keep it from diverging on plain walls and fast turns; the luminance term holds what geometry leaves free.
+A step costs one pass over the points instead of a rendering, so a frame needs milliseconds. Damping and step control
+keep it from diverging on plain walls and fast turns; the luminance term holds what geometry leaves free.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,10 +16,55 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import se3
+from .config import Config
 from .field import TsdfField
 from .kernels import AlignSettings, Backend, NormalEquations
+from .observed import ObservedVoxels
+from .pixels import Pixels
 
 DAMPING = (1e-4, 1e-8, 1e4)
+WIDE_GRADIENT = (0.3, 2.0)
+LEAST_KNOWN = 100
+LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255
+
+
+class Surface(Protocol):
+    """Something with a signed distance that points can be aligned to: the fused volume or the learned map."""
+
+    def distances(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Signed distance [N] in metres at world points [N, 3], and whether it is known there."""
+        ...
+
+    def normal_equations(
+        self, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
+    ) -> NormalEquations:
+        """See ``kernels.reference.normal_equations``; c2w [4, 4] and camera points [N, 3] lie on the CPU."""
+        ...
+
+
+@dataclass(frozen=True)
+class LearnedSurface:
+    """The learned map as a ``Surface``; known where it has been observed."""
+
+    field: TsdfField
+    kernels: Backend
+    truncation_m: float
+    observed: ObservedVoxels
+
+    def distances(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """See ``Surface``."""
+        at = torch.from_numpy(points.astype(np.float32)).to(self.field.device)
+        sdf, _ = self.kernels.values(self.field.layout, self.field.params, at)
+        return sdf.cpu().numpy() * np.float32(self.truncation_m), self.observed.contains(points)
+
+    def normal_equations(
+        self, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
+    ) -> NormalEquations:
+        """See ``Surface``."""
+        device = self.field.device
+        pose, points, luminance = c2w.to(device).float(), points.to(device), luminance.to(device)
+        found = self.kernels.normal_equations(self.field.layout, self.field.params, pose, points, luminance, settings)
+        return replace(found, jtj=found.jtj.cpu(), jtr=found.jtr.cpu())
 
 
 @dataclass(frozen=True)
@@ -29,24 +75,66 @@ class Alignment:
     cost: float
 
 
-def align(
-    field: TsdfField,
-    kernels: Backend,
-    points: Tensor,
-    luminance: Tensor,
+def stages(config: Config) -> list[AlignSettings]:
+    """The settings of each stage, coarse to fine; the last one trusts the narrow range of gradient norms."""
+    a = config.align
+    wide = AlignSettings(
+        truncation_m=config.truncation_m,
+        kernel_m=0.0,
+        tsdf_limit=a.tsdf_limit,
+        gradient_low=WIDE_GRADIENT[0],
+        gradient_high=WIDE_GRADIENT[1],
+        colour_weight=a.colour_weight_m,
+        colour_kernel=a.colour_kernel,
+    )
+    out = [replace(wide, kernel_m=kernel) for kernel in a.kernels_m]
+    low, high = a.gradient_range
+    out[-1] = replace(out[-1], gradient_low=low, gradient_high=high)
+    return out
+
+
+@dataclass(frozen=True)
+class Points:
+    """Measured points to align. local: float32 [N, 3], camera coordinates in metres. light: float32 [N] in 0..1."""
+
+    local: Tensor
+    light: Tensor
+
+
+def known_points(surface: Surface, pixels: Pixels, guess: NDArray[np.float64]) -> Points:
+    """The measured points of ``pixels`` that lie, seen from ``guess`` [4, 4], where the surface is known; all of them
+    when that leaves too few."""
+    local, light = pixels.points(), pixels.color[pixels.depth > 0].astype(np.float32) @ LUMINANCE
+    _, known = surface.distances(transform(guess, local))
+    if known.sum() >= LEAST_KNOWN:
+        local, light = local[known], light[known]
+    return Points(torch.from_numpy(local), torch.from_numpy(light))
+
+
+def align(surface: Surface, points: Points, guess: NDArray[np.float64], config: Config) -> Alignment:
+    """Move ``points`` from ``guess`` [4, 4] onto the surface, coarse to fine."""
+    return descend(surface, points, guess, stages(config), config.align.iterations)
+
+
+def cost_at(surface: Surface, points: Points, c2w: NDArray[np.float64], config: Config) -> float:
+    """What ``align`` minimises in its last stage, at c2w [4, 4]: robust, per point, in squared metres."""
+    last = stages(config)[-1]
+    found = surface.normal_equations(torch.from_numpy(c2w), points.local, points.light, last)
+    return objective(found, len(points.local), last) / max(len(points.local), 1)
+
+
+def descend(
+    surface: Surface,
+    points: Points,
     guess: NDArray[np.float64],
-    stages: Sequence[AlignSettings],
+    settings: Sequence[AlignSettings],
     iterations: int,
 ) -> Alignment:
-    """Move camera points [N, 3] (metres, luminance [N] in 0..1) from ``guess`` [4, 4] onto the map's surface.
-
-    Coarse to fine through ``stages``, at most ``iterations`` steps in each.
-    """
+    """Levenberg-Marquardt from ``guess`` [4, 4] through all ``settings``, at most ``iterations`` steps with each."""
     c2w = torch.from_numpy(guess)
-    total = len(points)
-    equations, stage = None, stages[0]
-    for stage in stages:
-        equations = _evaluate(field, kernels, c2w, points, luminance, stage)
+    total, cost = len(points.local), 0.0
+    for stage in settings:
+        equations = surface.normal_equations(c2w, points.local, points.light, stage)
         damping = DAMPING[0]
         for _ in range(iterations):
             if equations.used < 6:
@@ -54,8 +142,8 @@ def align(
             diagonal = torch.diag(equations.jtj.diagonal() + 1e-9)
             move = -torch.linalg.solve(equations.jtj + damping * diagonal, equations.jtr)
             trial = se3.retract(c2w, move)
-            found = _evaluate(field, kernels, trial, points, luminance, stage)
-            before, after = _objective(equations, total, stage), _objective(found, total, stage)
+            found = surface.normal_equations(trial, points.local, points.light, stage)
+            before, after = objective(equations, total, stage), objective(found, total, stage)
             if after < before:
                 c2w, equations, damping = trial, found, max(damping / 3, DAMPING[1])
                 if before - after < 1e-5 * before or float(move.abs().max()) < 1e-5:
@@ -64,20 +152,18 @@ def align(
                 damping *= 10
                 if damping > DAMPING[2] or float(move.abs().max()) < 1e-6:
                     break
-    assert equations is not None
-    return Alignment(c2w.numpy(), _objective(equations, total, stage) / max(total, 1))
+        cost = objective(equations, total, stage)
+    return Alignment(c2w.numpy(), cost / max(total, 1))
 
 
-def _evaluate(
-    field: TsdfField, kernels: Backend, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
-) -> NormalEquations:
-    pose = c2w.to(points)
-    return kernels.normal_equations(field.layout, field.params, pose, points, luminance, settings)
-
-
-def _objective(equations: NormalEquations, total: int, settings: AlignSettings) -> float:
+def objective(equations: NormalEquations, total: int, settings: AlignSettings) -> float:
     """Robust cost in which a dropped point counts as an outlier, so that dropping points never pays."""
     worst = settings.kernel_m**2
     if settings.colour_weight > 0:
         worst += (settings.colour_weight * settings.colour_kernel) ** 2
     return equations.cost + 0.5 * worst * (total - equations.used)
+
+
+def transform(c2w: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Camera points [N, 3] in the world of c2w [4, 4]."""
+    return points @ c2w[:3, :3].T + c2w[:3, 3]

@@ -68,25 +68,35 @@ class LossWeights:
 
 
 @dataclass(frozen=True)
-class TrackingConfig:
-    """Pose of each frame against the fixed map.
+class AlignConfig:
+    """Direct alignment of each frame's measured points (ours), from which rendered tracking starts.
 
-    ``adam`` is the paper's: the learning rates and loss weights; with ``warm_start`` (ours) it begins where a direct
-    alignment ends. ``lm`` is ours: the fields from kernels_m to
-    colour_kernel, see ``AlignSettings``.
+    to: the surface aligned to: the ``fused`` TSDF volume kept beside the map, the ``learned`` map itself, or ``none``,
+    which leaves the paper's tracking alone. points: measured points used; iterations: at most, per stage; kernels_m:
+    one stage each, coarse to fine; gradient_range: gradient norms trusted in the last stage. The other fields: see
+    ``AlignSettings``. voxel_m: edge of the fused volume's voxels.
     """
 
-    method: Literal["adam", "lm"] = "adam"
-    warm_start: bool = True
-    iterations: int = _number(8, 1, 500)
-    rays: int = _number(1000, 16, 200_000)
-    lr_rotation: float = _number(1e-3, 0.0, 1.0)
-    lr_translation: float = _number(1e-3, 0.0, 1.0)
-    kernels_m: tuple[float, ...] = (0.06, 0.02, 0.02)
+    to: Literal["fused", "learned", "none"] = "fused"
+    voxel_m: float = _number(0.02, 1e-3, 1.0)
+    points: int = _number(2000, 64, 200_000)
+    iterations: int = _number(10, 1, 100)
+    kernels_m: tuple[float, ...] = (0.06, 0.02)
     tsdf_limit: float = _number(1.2, 0.1, 10.0)
     gradient_range: tuple[float, ...] = (0.75, 1.3)
     colour_weight_m: float = _number(0.05, 0.0, 1.0)
     colour_kernel: float = _number(0.2, 1e-3, 10.0)
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """The paper's rendered tracking: Adam on the losses of a frame's rays against the fixed map. ``iterations`` 0
+    leaves it out, and direct alignment alone tracks."""
+
+    iterations: int = _number(8, 0, 500)
+    rays: int = _number(1000, 16, 200_000)
+    lr_rotation: float = _number(1e-3, 0.0, 1.0)
+    lr_translation: float = _number(1e-3, 0.0, 1.0)
     loss: LossWeights = LossWeights(10.0, 200.0, 50.0, 1.0, 1.0, 5.0, 5.0)
 
 
@@ -140,6 +150,7 @@ class Config:
     keyframe_share: float = _number(0.05, 1e-4, 1.0)
     field: FieldConfig = FieldConfig()
     sampling: SamplingConfig = SamplingConfig()
+    align: AlignConfig = AlignConfig()
     tracking: TrackingConfig = TrackingConfig()
     mapping: MappingConfig = MappingConfig()
     window: WindowConfig = WindowConfig()

@@ -84,7 +84,20 @@ def choose_pixels(frame: Frame, camera: Intrinsics, count: int, config: Config, 
         v = rng.integers(border, height - border, count)
         u = rng.integers(border, width - border, count)
         index, feature = v * width + u, np.zeros(count, bool)
-    v, u = np.divmod(index, width)
+    return _read(frame, camera, index, feature, config)
+
+
+def spread_pixels(frame: Frame, camera: Intrinsics, count: int, config: Config, rng: np.random.Generator) -> Pixels:
+    """``count`` pixels of a frame from the jittered grid alone, which costs no feature detection."""
+    height, width = frame.depth.shape
+    index = grid_points(height, width, _border(config, height, width), count, rng)
+    return _read(frame, camera, index, np.zeros(count, bool), config)
+
+
+def _read(
+    frame: Frame, camera: Intrinsics, index: NDArray[np.int64], feature: NDArray[np.bool_], config: Config
+) -> Pixels:
+    v, u = np.divmod(index, frame.depth.shape[1])
     direction = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], 1).astype(np.float32)
     depth = frame.depth.reshape(-1)[index]
     depth = np.where((depth >= config.depth_near_m) & (depth <= config.depth_far_m), depth, np.float32(0))

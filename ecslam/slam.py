@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from . import kernels as seam
+from .align import LearnedSurface, Surface, align, cost_at, known_points
 from .config import Config
 from .field import TsdfField, box_of_points, create_field
 from .keyframes import Keyframe, make_thumbnail, most_similar
@@ -23,17 +24,20 @@ from .loops import LoopDetector
 from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
 from .observed import ObservedVoxels
-from .pixels import Pixels, choose_pixels
+from .pixels import Pixels, choose_pixels, spread_pixels
 from .recovery import Recovery, best_start
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .se3 import rotation_angle_deg
-from .tracker import TrackResult, track_adam, track_direct
+from .tracker import TrackResult, fit, track_adam, track_direct
 from .trajectory import Trajectory
-from .types import Frame, FrameError, Intrinsics
+from .types import Frame, FrameError, InputError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
+from .volume import FusedVolume
 from .window import random_window, select_window
 
 Interrupt = Callable[[], None]
+LEAST_POINTS = 64
+WORSE = 1.05  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
 RELOCALISE_FROM = 5
 RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
 
@@ -51,7 +55,9 @@ class Slam:
         first_pose: NDArray[np.float64] | None = None,
     ) -> None:
         """bounds: scene box [2, 3] metres, derived from the first frame when None. first_pose: c2w [4, 4] of the first
-        frame, the identity when None; it stays fixed."""
+        frame, the identity when None; it stays fixed. Raises InputError when the configuration leaves nothing that
+        tracks."""
+        _require_tracking(config)
         self.config, self.intrinsics = config, intrinsics
         self.device = device or torch.device("cpu")
         self.kernels_name, self._kernels, self.kernels_note = seam.select(self.device)
@@ -64,6 +70,8 @@ class Slam:
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._observed = ObservedVoxels()
+        fused = config.align.to == "fused"
+        self._volume = FusedVolume(config.align.voxel_m, config.truncation_m) if fused else None
         self._loops, self._recovery = LoopDetector(), Recovery()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
         self._pending: Future[MapResult] | None = None
@@ -78,11 +86,12 @@ class Slam:
             return self._first_frame(frame, interrupt)
         started = time.perf_counter()
         self._apply_pending(block=False)
-        pixels = choose_pixels(frame, self.intrinsics, self.config.tracking.rays, self.config, self._rng)
-        track = self._track(frame, pixels)
+        track = self._track(frame)
         index, lost = len(self.trajectory), self._recovery.lost
         keyframe = index % self.config.keyframe_every == 0 and not lost
         self.trajectory.append(track.c2w, frame.timestamp, not self._recovery.missed, keyframe)
+        if not self._recovery.missed:
+            self._fuse(frame)
         tracked = time.perf_counter()
         losses, loop = track.losses, None
         if keyframe:
@@ -125,6 +134,7 @@ class Slam:
             self.trajectory, self.keyframes = Trajectory(), []
             raise
         self._apply(result)
+        self._fuse(frame)
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,
@@ -150,17 +160,39 @@ class Slam:
 
     # ---- tracking ---------------------------------------------------------------------------------------------------
 
-    def _track(self, frame: Frame, pixels: Pixels) -> TrackResult:
+    def _track(self, frame: Frame) -> TrackResult:
         """Constant-velocity start, the preset's tracker, and recovery when the map does not explain the frame."""
-        field = self._require_field()
         guess = self.trajectory.predict() if not self._recovery.lost else self.trajectory[-1]
-        usable = len(pixels.points()) >= 64
-        if usable:
-            pixels = self._known(pixels, guess)
-        track = self._track_from(field, pixels, guess) if usable else TrackResult(guess, {}, 0.0)
+        measured = spread_pixels(frame, self.intrinsics, self.config.align.points, self.config, self._rng)
+        usable = len(measured.points()) >= LEAST_POINTS
+        track = self._track_from(frame, measured, guess) if usable else TrackResult(guess, {}, 0.0)
         return self._recovery.judge(
-            track, self.trajectory[-1], lambda: self._relocalise(field, frame, pixels) if usable else None
+            track, self.trajectory[-1], lambda: self._relocalise(frame, measured) if usable else None
         )
+
+    def _track_from(self, frame: Frame, measured: Pixels, guess: NDArray[np.float64]) -> TrackResult:
+        """Direct alignment of the ``measured`` points, then the paper's rendered tracking; the preset may leave either
+        out."""
+        config, surface = self.config, self._surface()
+        c2w, losses = guess, {}
+        points = known_points(surface, measured, guess)
+        if config.align.to != "none":
+            found = align(surface, points, guess, config)
+            c2w, losses = found.c2w, {"align_mm": 1e3 * found.cost**0.5}
+        if config.tracking.iterations > 0:
+            pixels = choose_pixels(frame, self.intrinsics, config.tracking.rays, config, self._rng)
+            pixels = self._known(pixels, c2w)
+            rendered, losses = track_adam(self._require_field(), self._kernels, pixels, c2w, config, self._generator)
+            agreed = WORSE * cost_at(surface, points, c2w, config)
+            if config.align.to == "none" or cost_at(surface, points, rendered, config) <= agreed:
+                c2w = rendered
+        return TrackResult(c2w, losses, fit(surface, measured, c2w, config.truncation_m))
+
+    def _surface(self) -> Surface:
+        return self._volume if self._volume is not None else self._learned()
+
+    def _learned(self) -> LearnedSurface:
+        return LearnedSurface(self._require_field(), self._kernels, self.config.truncation_m, self._observed)
 
     def _known(self, pixels: Pixels, guess: NDArray[np.float64]) -> Pixels:
         """The pixels whose measured point, seen from ``guess``, lies where the map has been observed; all of them when
@@ -169,21 +201,18 @@ class Slam:
         known = self._observed.contains(local @ guess[:3, :3].T + guess[:3, 3]) & (pixels.depth > 0)
         return pixels.take(np.flatnonzero(known)) if known.sum() >= 100 else pixels
 
-    def _track_from(self, field: TsdfField, pixels: Pixels, guess: NDArray[np.float64]) -> TrackResult:
-        if self.config.tracking.method == "lm":
-            return track_direct(field, self._kernels, pixels, guess, self.config)
-        if self.config.tracking.warm_start:
-            guess = track_direct(field, self._kernels, pixels, guess, self.config).c2w
-        return track_adam(field, self._kernels, pixels, guess, self.config, self._generator)
+    def _fuse(self, frame: Frame) -> None:
+        if self._volume is not None:
+            near, far = self.config.depth_near_m, self.config.depth_far_m
+            self._volume.integrate(frame, self.intrinsics, self.trajectory[-1], near, far)
 
-    def _relocalise(self, field: TsdfField, frame: Frame, pixels: Pixels) -> TrackResult:
+    def _relocalise(self, frame: Frame, measured: Pixels) -> TrackResult:
         """Direct alignment with a wide basin from the last pose and from the keyframes that look most alike."""
         poses = self.trajectory.keyframe_poses()
         alike = most_similar(self.keyframes, make_thumbnail(frame.color), RELOCALISE_FROM)
-        tracking = replace(self.config.tracking, kernels_m=RELOCALISE_KERNELS_M, iterations=20)
-        wide = replace(self.config, tracking=tracking)
+        wide = replace(self.config, align=replace(self.config.align, kernels_m=RELOCALISE_KERNELS_M, iterations=20))
         starts = [self.trajectory[-1], *(poses[i] for i in alike)]
-        return best_start(lambda start: track_direct(field, self._kernels, pixels, start, wide), starts)
+        return best_start(lambda start: track_direct(self._surface(), measured, start, wide), starts)
 
     # ---- mapping ----------------------------------------------------------------------------------------------------
 
@@ -290,9 +319,13 @@ class Slam:
         return render_view(self._require_field(), self._kernels, camera, c2w, depth, self.config)
 
     def configure(self, config: Config) -> None:
-        """Change tracking and mapping settings from the next frame on; the field keeps its shape."""
+        """Change tracking and mapping settings from the next frame on; the field and the volume keep their shape."""
         self._apply_pending(block=True)
-        self.config = replace(config, field=self.config.field, schedule=self.config.schedule, seed=self.config.seed)
+        kept = self.config
+        shape = replace(config.align, to=kept.align.to, voxel_m=kept.align.voxel_m)
+        config = replace(config, field=kept.field, schedule=kept.schedule, seed=kept.seed, align=shape)
+        _require_tracking(config)
+        self.config = config
 
     def state(self) -> Arrays:
         """Everything that ``restore`` needs, as arrays nobody writes to afterwards."""
@@ -305,6 +338,7 @@ class Slam:
             **prefixed("random", pack_random(self._rng, self._generator)),
             "bounds": np.zeros((0, 3)) if self._bounds is None else self._bounds,
             "observed": self._observed.keys,
+            **prefixed("volume", self._volume.state() if self._volume is not None else {}),
             "inside_loop": np.array(self._loops.inside),
             "lost": np.array([self._recovery.lost, self._recovery.misses]),
         }
@@ -322,6 +356,8 @@ class Slam:
         self._frozen = self._tracking_field()
         unpack_random(part("random", state), self._rng, self._generator)
         self._observed.keys = np.array(state["observed"], np.int64)
+        if self._volume is not None:
+            self._volume.load(part("volume", state))
         self._loops.inside = bool(state["inside_loop"])
         self._recovery.lost, self._recovery.misses = bool(state["lost"][0]), int(state["lost"][1])
         return self
@@ -333,3 +369,8 @@ class Slam:
 
 def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:
     return (pixels.points() @ c2w[:3, :3].T + c2w[:3, 3]).astype(np.float32)
+
+
+def _require_tracking(config: Config) -> None:
+    if config.align.to == "none" and config.tracking.iterations == 0:
+        raise InputError("align.to is none and tracking.iterations is 0, so nothing tracks; change one of them")

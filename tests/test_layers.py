@@ -21,7 +21,7 @@ LAYERS = (
     ("se3",),
     ("kernels",),
     ("field",),
-    ("pixels", "samples", "rays", "rendering", "losses", "datasets", "observed"),
+    ("pixels", "samples", "rays", "rendering", "losses", "datasets", "observed", "volume"),
     ("keyframes", "window", "trajectory", "pose_adam", "views", "saving"),
     ("align", "tracker", "mapper", "loops", "recovery", "meshing", "meshing_blocks", "meshing_table", "evaluation"),
     ("slam",),

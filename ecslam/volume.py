@@ -1,0 +1,101 @@
+"""A plain fused TSDF beside the learned map: every frame is averaged in at once, so tracking has a second opinion that
+needs no training (Curless and Levoy 1996; sparse blocks as in Niessner et al. 2013). Ours, not the paper's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .kernels import AlignSettings, NormalEquations, fusion
+from .types import Frame, Intrinsics
+
+STRIDE = 4
+ROWS, LISTED = 4096, 16384
+
+
+class FusedVolume:
+    """Sparse voxels of ``voxel_m`` metres with a truncated distance; the engine thread alone writes it."""
+
+    def __init__(self, voxel_m: float, truncation_m: float) -> None:
+        self.voxel_m, self.truncation_m = voxel_m, truncation_m
+        self.used = 0
+        self._blocks = _allocate(ROWS)
+        self._stamp = np.full(ROWS, -1, np.int64)
+        self._listed = np.empty(LISTED, np.int64)
+        self._now = 0
+
+    def integrate(
+        self, frame: Frame, camera: Intrinsics, c2w: NDArray[np.float64], near_m: float, far_m: float
+    ) -> None:
+        """Average a frame seen from c2w [4, 4] into the volume; depth outside near..far counts as none."""
+        depth = frame.depth * ((frame.depth >= near_m) & (frame.depth <= far_m))
+        light = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1 / 255)
+        numbers = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+        step = fusion.NORMAL_STRIDE
+        normal = np.empty((-(-depth.shape[0] // step), -(-depth.shape[1] // step), 3), np.float32)
+        fusion.normals(depth, numbers, normal)
+        view = fusion.View(depth, light, normal, numbers, np.ascontiguousarray(c2w))
+        reach = self.truncation_m
+        self._now += 1
+        while True:
+            used, listed = fusion.touch(
+                self._blocks, self.used, view, STRIDE, reach, self.voxel_m, self._stamp, self._now, self._listed
+            )
+            self.used = used
+            if listed >= 0:
+                break
+            self._grow()
+            self._now += 1
+        fusion.integrate(self._blocks, self._listed[:listed], view, self.voxel_m, self.truncation_m)
+
+    def _grow(self) -> None:
+        self._load(self._blocks.place[: self.used], self._blocks.voxels[: self.used], 2 * len(self._blocks.place))
+
+    def _load(self, place: NDArray[np.int64], voxels: NDArray[np.int16], rows: int) -> None:
+        self._blocks, self.used = _allocate(rows), len(place)
+        self._blocks.place[: self.used], self._blocks.voxels[: self.used] = place, voxels
+        fusion.rehash(self._blocks, self.used)
+        self._stamp = np.full(rows, -1, np.int64)
+        self._listed = np.empty(max(LISTED, rows), np.int64)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The voxels as arrays nobody writes to afterwards, for a checkpoint."""
+        return {"place": self._blocks.place[: self.used].copy(), "voxels": self._blocks.voxels[: self.used].copy()}
+
+    def load(self, state: dict[str, NDArray[Any]]) -> None:
+        """Go on from what ``state`` gave."""
+        self._load(state["place"], state["voxels"], max(ROWS, 1 << len(state["place"]).bit_length()))
+
+    def distances(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Signed distance [N] in metres at world points [N, 3], and whether it is known there."""
+        distance, known = np.empty(len(points), np.float32), np.empty(len(points), np.bool_)
+        fusion.sample_points(
+            self._blocks, np.ascontiguousarray(points, np.float64), self.voxel_m, self.truncation_m, distance, known
+        )
+        return distance, known
+
+    def normal_equations(
+        self, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
+    ) -> NormalEquations:
+        """Sums for one Gauss-Newton step, as ``kernels.reference.normal_equations`` has them for the learned map."""
+        sums = np.zeros(45)
+        numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
+        pose = c2w.detach().to(torch.float64).contiguous().numpy()
+        fusion.align_sums(self._blocks, pose, points.numpy(), luminance.numpy(), self.voxel_m, numbers, sums)
+        total = torch.from_numpy(sums)
+        return NormalEquations(total[:36].reshape(6, 6), total[36:42], float(sums[42]), int(sums[44]), int(sums[43]))
+
+
+def _allocate(rows: int) -> fusion.Blocks:
+    slots = 4 * rows
+    return fusion.Blocks(
+        np.full(slots, fusion.EMPTY, np.int64),
+        np.empty(slots, np.int32),
+        np.empty(rows, np.int64),
+        np.zeros((rows, fusion.CELLS, 3), np.int16),
+    )

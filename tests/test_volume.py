@@ -1,0 +1,159 @@
+"""The fused TSDF volume: distances of known surfaces, growth, and the sums that alignment needs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ecslam import se3, volume
+from ecslam.align import align, cost_at, known_points, stages
+from ecslam.config import Config
+from ecslam.pixels import spread_pixels
+from ecslam.types import Frame, Intrinsics
+from ecslam.volume import FusedVolume
+
+CAMERA = Intrinsics(160.0, 160.0, 79.5, 59.5, 160, 120)
+CONFIG = Config(border_px=4)
+
+
+def rays():
+    v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
+    return np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
+
+
+def look(c2w, planes):
+    """What a camera sees of planes (n, d) with n . x = d: depth, and a smooth texture fixed in the world."""
+    direction = rays() @ c2w[:3, :3].T
+    depth = np.full(direction.shape[:2], np.inf)
+    for n, d in planes:
+        with np.errstate(divide="ignore"):
+            t = (d - c2w[:3, 3] @ n) / (direction @ n)
+        depth = np.where((t > 0) & (t < depth), t, depth)
+    hit = np.isfinite(depth)
+    point = c2w[:3, 3] + direction * np.where(hit, depth, 0)[..., None]
+    light = 0.5 + 0.25 * (np.sin(9 * point[..., 0]) + np.cos(8 * point[..., 1] + 3 * point[..., 2]))
+    color = np.repeat((255 * light).round().astype(np.uint8)[..., None], 3, -1)
+    return Frame(0, 0.0, color, np.where(hit, depth, 0).astype(np.float32))
+
+
+def corner():
+    return [(np.array([0, 0, 1.0]), 2.0), (np.array([0, 1.0, 0]), 0.7), (np.array([1.0, 0, 0]), 0.9)]
+
+
+def pose(rotation_deg=(0, 0, 0), centre=(0, 0, 0)):
+    xi = torch.tensor([*centre, *np.radians(rotation_deg)], dtype=torch.float64)
+    return se3.retract(torch.eye(4, dtype=torch.float64), xi).numpy()
+
+
+def fused(planes, poses, voxel_m=0.02):
+    out = FusedVolume(voxel_m, 0.06)
+    for c2w in poses:
+        out.integrate(look(c2w, planes), CAMERA, c2w, 0.1, 8.0)
+    return out
+
+
+@pytest.mark.parametrize("tilt_deg", [0, 25, 50])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_distance_to_a_plane(tilt_deg, sign):
+    c2w = pose((3, -2, 5), (sign * 3.3, sign * -1.7, sign * 0.2))
+    forward = c2w[:3, 2]
+    tilt = np.radians(tilt_deg)
+    n = np.cos(tilt) * forward + np.sin(tilt) * c2w[:3, 0]
+    d = float(n @ (c2w[:3, 3] + 1.5 * forward))
+    found = fused([(n, d)], [c2w])
+    rng = np.random.default_rng(0)
+    side = np.stack([c2w[:3, 1], np.cross(n, c2w[:3, 1])])
+    base = c2w[:3, 3] + 1.5 * forward
+    true = rng.uniform(-0.03, 0.03, 500)
+    points = base + rng.uniform(-0.25, 0.25, (500, 2)) @ side - true[:, None] * n
+    distance, known = found.distances(points)
+    assert known.mean() > 0.95
+    np.testing.assert_allclose(distance[known], true[known], atol=1e-3)
+
+
+def test_what_nobody_saw_is_unknown():
+    found = fused([(np.array([0, 0, 1.0]), 2.0)], [np.eye(4)])
+    _, known = found.distances(np.array([[0, 0, 2.3], [0, 0, -1.0], [40.0, 0, 2], [0, 0, 2.0]]))
+    assert known.tolist() == [False, False, False, True]
+    _, known = FusedVolume(0.02, 0.06).distances(np.zeros((3, 3)))
+    assert not known.any()
+    assert FusedVolume(0.02, 0.06).distances(np.empty((0, 3)))[0].shape == (0,)
+
+
+def test_depth_out_of_range_adds_nothing():
+    out = FusedVolume(0.02, 0.06)
+    out.integrate(look(np.eye(4), [(np.array([0, 0, 1.0]), 2.0)]), CAMERA, np.eye(4), 0.1, 1.9)
+    assert out.used == 0
+
+
+def test_growing_changes_nothing(monkeypatch):
+    poses = [pose((0, 4 * k, 0)) for k in range(3)]
+    large = fused(corner(), poses)
+    monkeypatch.setattr(volume, "ROWS", 4)
+    monkeypatch.setattr(volume, "LISTED", 4)
+    small = fused(corner(), poses)
+    points = np.random.default_rng(1).uniform(-1, 2.1, (4000, 3))
+    assert large.used == small.used > 100
+    for a, b in zip(large.distances(points), small.distances(points), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_state_goes_round():
+    one = fused(corner(), [np.eye(4)])
+    two = FusedVolume(0.02, 0.06)
+    two.load(one.state())
+    next_pose = pose((0, 5, 0), (0.1, 0, 0))
+    for v in (one, two):
+        v.integrate(look(next_pose, corner()), CAMERA, next_pose, 0.1, 8.0)
+    for name, value in one.state().items():
+        np.testing.assert_array_equal(value, two.state()[name])
+
+
+def measured(planes, c2w, count=2000):
+    return spread_pixels(look(c2w, planes), CAMERA, count, CONFIG, np.random.default_rng(2))
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.05])
+def test_sums_are_the_derivative_of_the_cost(colour):
+    """Laws: jtr is the slope of the robust cost to first order in the weights, used counts what took part."""
+    found = fused(corner(), [np.eye(4), pose((0, 6, 2))])
+    at = pose((0.4, -0.3, 0.2), (0.006, -0.004, 0.005))
+    points = known_points(found, measured(corner(), np.eye(4)), at)
+    settings = replace(stages(CONFIG)[0], colour_weight=colour, gradient_low=0.0, gradient_high=1e9, tsdf_limit=1e9)
+    c2w = torch.from_numpy(at)
+    sums = found.normal_equations(c2w, points.local, points.light, settings)
+    assert sums.used > 500
+    assert sums.inliers <= sums.used
+    torch.testing.assert_close(sums.jtj, sums.jtj.T)
+    assert float(torch.linalg.eigvalsh(sums.jtj)[0]) > 0
+    for k in range(6):
+        step = torch.zeros(6, dtype=torch.float64)
+        step[k] = 1e-5
+        up = found.normal_equations(se3.retract(c2w, step), points.local, points.light, settings)
+        down = found.normal_equations(se3.retract(c2w, -step), points.local, points.light, settings)
+        slope = (up.cost - down.cost) / 2e-5
+        assert slope == pytest.approx(float(sums.jtr[k]), rel=0.03, abs=2e-3 * float(sums.jtr.abs().max()))
+
+
+def test_alignment_finds_the_pose_in_a_corner():
+    found = fused(corner(), [np.eye(4), pose((0, 6, 2)), pose((4, -5, 0))])
+    true = pose((2, 3, -1), (0.02, 0.01, -0.02))
+    guess = pose((3, 2, 0), (0.05, -0.01, 0.01))
+    points = known_points(found, measured(corner(), true), guess)
+    result = align(found, points, guess, CONFIG)
+    assert np.linalg.norm(result.c2w[:3, 3] - true[:3, 3]) < 2e-3
+    assert float(se3.rotation_angle_deg(result.c2w, true)) < 0.1
+    assert result.cost == pytest.approx(cost_at(found, points, result.c2w, CONFIG))
+    assert result.cost < cost_at(found, points, guess, CONFIG)
+
+
+def test_colour_holds_what_a_plain_wall_leaves_free():
+    wall = [(np.array([0, 0, 1.0]), 1.5)]
+    found = fused(wall, [np.eye(4), pose(centre=(0.05, 0, 0))])
+    true, guess = pose(centre=(0.02, 0.01, 0)), pose(centre=(0.04, -0.01, 0.01))
+    points = known_points(found, measured(wall, true), guess)
+    with_colour = align(found, points, guess, CONFIG).c2w
+    without = align(found, points, guess, replace(CONFIG, align=replace(CONFIG.align, colour_weight_m=0.0))).c2w
+    assert np.linalg.norm(with_colour[:3, 3] - true[:3, 3]) < 3e-3
+    assert np.linalg.norm(without[:3, 3] - true[:3, 3]) > 0.01
