@@ -1,0 +1,107 @@
+"""Triton kernels for gradients in space: TSDF and luminance with theirs at points, and the sums of direct alignment."""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from ._gpu_decoders import decode, into_features, into_hidden, layer_one, through_blob
+from ._gpu_field import gather, place, pull
+from ._gpu_points import moved, triple
+
+RED, GREEN, BLUE = tl.constexpr(0.299), tl.constexpr(0.587), tl.constexpr(0.114)
+SUMS = 67  # [8, 8] products of (jacobian, residual, 0), then cost, used, inliers
+
+
+@triton.jit
+def into_world(field, hidden, d_out, at, fraction, phase, inside, live, shape: tl.constexpr):
+    """Gradient by the world position, per metre (x, y, z: [P] each), from those of the outputs before their sigmoid."""
+    d_hidden = into_hidden(field, hidden, d_out)
+    d_even, d_odd = into_features(field, d_hidden, shape)
+    gx, gy, gz = pull(field, at, fraction, d_even, d_odd, live, shape)
+    gx += through_blob(field, d_hidden, phase, 0, shape)
+    gy += through_blob(field, d_hidden, phase, 1, shape)
+    gz += through_blob(field, d_hidden, phase, 2, shape)
+    return gx * inside[0], gy * inside[1], gz * inside[2]
+
+
+@triton.jit
+def both_gradients(field, world, live, colour: tl.constexpr, shape: tl.constexpr):
+    """TSDF and its gradient, luminance and (with ``colour``) its gradient, at world positions."""
+    at, fraction, phase, inside = place(field, world, shape)
+    hidden = layer_one(field, gather(field, at, fraction, live, shape), phase, shape)
+    sdf, red, green, blue = decode(field, hidden)
+    none, one = tl.zeros_like(sdf), tl.zeros_like(sdf) + 1
+    d_sdf = into_world(field, hidden, (one, none, none, none), at, fraction, phase, inside, live, shape)
+    luminance = red * RED + green * GREEN + blue * BLUE
+    d_luminance = (none, none, none)
+    if colour:
+        d_out = (none, red * (1 - red) * RED, green * (1 - green) * GREEN, blue * (1 - blue) * BLUE)
+        d_luminance = into_world(field, hidden, d_out, at, fraction, phase, inside, live, shape)
+    return sdf, d_sdf, luminance, d_luminance
+
+
+@triton.jit
+def gradients_kernel(field, points, sdf, d_sdf, luminance, d_luminance, shape: tl.constexpr, block: tl.constexpr):
+    """TSDF [N], its gradient [N, 3], luminance [N], its gradient [N, 3] at ``points.position`` [N, 3] in the world."""
+    i = tl.program_id(0) * block + tl.arange(0, block)
+    live = i < points.total
+    found = both_gradients(field, triple(points.position + 3 * i, live), live, True, shape)
+    tl.store(sdf + i, found[0], live)
+    tl.store(luminance + i, found[2], live)
+    for k in tl.static_range(3):
+        tl.store(d_sdf + 3 * i + k, found[1][k], live)
+        tl.store(d_luminance + 3 * i + k, found[3][k], live)
+
+
+@triton.jit
+def robust(residual, kernel):
+    """Geman-McClure of residuals, float64: share k^2 / (k^2 + r^2); the weight is its square."""
+    k = kernel.to(tl.float64)
+    return k * k / (k * k + residual * residual)
+
+
+@triton.jit
+def add_products(sums, residual, gradient, lever, kernel, keep):
+    """Add one residual a point, with its gradient by the world position, to the sums; returns the shares."""
+    r = residual.to(tl.float64)
+    gx, gy, gz = gradient[0].to(tl.float64), gradient[1].to(tl.float64), gradient[2].to(tl.float64)
+    x, y, z = lever
+    j3, j4, j5 = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+    column = tl.arange(0, 8)[None, :]
+    v = tl.where(column == 0, gx[:, None], tl.where(column == 1, gy[:, None], 0.0))
+    v = tl.where(column == 2, gz[:, None], tl.where(column == 3, j3[:, None], v))
+    v = tl.where(column == 4, j4[:, None], tl.where(column == 5, j5[:, None], v))
+    v = tl.where(column == 6, r[:, None], v)
+    share = tl.where(keep, robust(r, kernel), 0.0)
+    products = tl.sum((share * share)[:, None, None] * v[:, :, None] * v[:, None, :], 0)
+    row, column = tl.arange(0, 8)[:, None], tl.arange(0, 8)[None, :]
+    tl.atomic_add(sums + 8 * row + column, products, (row < 6) & (column < 7), sem="relaxed")
+    tl.atomic_add(sums + 64, tl.sum(0.5 * r * r * share), sem="relaxed")
+    return share
+
+
+@triton.jit
+def align_kernel(
+    field, points, luminance, settings, sums, colour: tl.constexpr, shape: tl.constexpr, block: tl.constexpr
+):
+    """Add a block's share to ``sums`` float64 [67]. points.position: camera points; settings: the fields of
+    ``AlignSettings`` in their order."""
+    truncation, near, limit, low, high, scale, colour_kernel = settings
+    i = tl.program_id(0) * block + tl.arange(0, block)
+    live = i < points.total
+    local = triple(points.position + 3 * i, live)
+    world = (moved(points.c2w, local, 0), moved(points.c2w, local, 1), moved(points.c2w, local, 2))
+    tx, ty, tz = tl.load(points.c2w + 3), tl.load(points.c2w + 7), tl.load(points.c2w + 11)
+    lever = (world[0] - tx.to(tl.float64), world[1] - ty.to(tl.float64), world[2] - tz.to(tl.float64))
+    sdf, d_sdf, light, d_light = both_gradients(field, world, live, colour, shape)
+    gx, gy, gz = d_sdf[0] * truncation, d_sdf[1] * truncation, d_sdf[2] * truncation
+    norm = tl.sqrt(gx * gx + gy * gy + gz * gz)
+    keep = live & (tl.abs(sdf) < limit) & (norm > low) & (norm < high)
+    share = add_products(sums, sdf * truncation, (gx, gy, gz), lever, near, keep)
+    tl.atomic_add(sums + 65, tl.sum(keep.to(tl.float64)), sem="relaxed")
+    tl.atomic_add(sums + 66, tl.sum((share * share > 0.5).to(tl.float64)), sem="relaxed")
+    if colour:
+        error = (light - tl.load(luminance + i, live, 0.0)) * scale
+        d_error = (d_light[0] * scale, d_light[1] * scale, d_light[2] * scale)
+        add_products(sums, error, d_error, lever, colour_kernel * scale, keep)

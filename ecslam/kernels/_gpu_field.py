@@ -1,0 +1,191 @@
+"""The encoding as Triton code: hash grid and one-blob of a block of points, and the way back, in registers.
+
+A tile [points, levels] holds one feature of every level, so nothing loops over levels, and both features of a table
+row are one load. Cells are found as if in float64: a position is a float32 and what rounding lost, so a point never
+lands in the neighbouring cell.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+PRIME_Y = tl.constexpr(-1640531535)  # 2654435761 as int32
+PRIME_Z = tl.constexpr(805459861)
+
+
+class Field(NamedTuple):
+    """What the kernels read. levels: int32 [L, 8] (offset, size - 1, first, dims); inverse: float32 [L, 2], one over
+    the voxel and what rounding lost; geometry: float64 [15] (anchor, blob low, 1 / blob size, box low, box high); the
+    rest as in ``FieldParams``."""
+
+    levels: Tensor
+    inverse: Tensor
+    geometry: Tensor
+    table: Tensor
+    w_in: Tensor
+    w_sdf: Tensor
+    w_rgb: Tensor
+
+
+class Shape(NamedTuple):
+    """Sizes known when a kernel is compiled. width, blobs: levels and bins padded to a power of two of at least 16,
+    the least that a matrix product takes."""
+
+    levels: int
+    width: int
+    bins: int
+    blobs: int
+
+
+@triton.jit
+def on_box(field, world, axis: tl.constexpr, shape: tl.constexpr):
+    """One coordinate, float64 [P]: its distance from the anchor as float32 and what rounding lost, whether it was
+    inside the box, and its one-blob phase in bins."""
+    at = field.geometry + axis
+    low, high = tl.load(at + 9), tl.load(at + 12)
+    x = tl.minimum(tl.maximum(world, low), high)
+    period = (x - tl.load(at + 3)) * tl.load(at + 6)
+    near = x - tl.load(at)
+    rounded = near.to(tl.float32)
+    lost = (near - rounded.to(tl.float64)).to(tl.float32)
+    phase = ((period - tl.floor(period)) * shape.bins).to(tl.float32)
+    return rounded, lost, (x == world).to(tl.float32), phase
+
+
+@triton.jit
+def locate(field, x, rest, axis: tl.constexpr, prime: tl.constexpr, shape: tl.constexpr):
+    """One axis at all levels [P, width]: the fraction within the cell, and what the two lattice points around it add
+    to a row number (a stride times the place where a level is dense, a factor of the hash where not)."""
+    level = tl.arange(0, shape.width)
+    known = level < shape.levels
+    inverse = tl.load(field.inverse + 2 * level, known, 0.0)[None, :]
+    correction = tl.load(field.inverse + 2 * level + 1, known, 0.0)[None, :]
+    wide = x[:, None] + tl.zeros([1, shape.width], tl.float32)
+    cell = tl.floor(wide * inverse)
+    fraction = tl.fma(wide, inverse + tl.zeros_like(wide), -cell) + (rest[:, None] * inverse + wide * correction)
+    over = tl.floor(fraction)
+    at = field.levels + 8 * level
+    first = tl.load(at + 2 + axis, known, 0)[None, :]
+    last = tl.load(at + 5 + axis, known, 0)[None, :] - 1
+    stride = tl.full([shape.width], 1, tl.int32)
+    if axis >= 1:
+        stride *= tl.load(at + 5, known, 0)
+    if axis == 2:
+        stride *= tl.load(at + 6, known, 0)
+    k = (cell + over).to(tl.int32)
+    near = tl.minimum(tl.maximum(k - first, 0), last) * stride[None, :]
+    far = tl.minimum(tl.maximum(k + 1 - first, 0), last) * stride[None, :]
+    dense = last >= 0
+    return fraction - over, (tl.where(dense, near, k * prime), tl.where(dense, far, (k + 1) * prime))
+
+
+@triton.jit
+def entry(field, x, y, z, live, shape: tl.constexpr):
+    """Where the two features of one corner lie in the table [P, width, 2], and which of them exist."""
+    level = tl.arange(0, shape.width)
+    known = level < shape.levels
+    at = field.levels + 8 * level
+    offset = tl.load(at, known, 0)[None, :]
+    mask = tl.load(at + 1, known, 0)[None, :]
+    dense = (tl.load(at + 5, known, 0) > 0)[None, :]
+    row = offset + tl.where(dense, x + y + z, (x ^ y ^ z) & mask)
+    there = live[:, None] & known[None, :]
+    return 2 * row[:, :, None] + tl.arange(0, 2)[None, None, :], there[:, :, None]
+
+
+@triton.jit
+def corner(field, x, y, z, live, shape: tl.constexpr):
+    """The two features of one corner at all levels: even [P, width], odd [P, width]."""
+    at, there = entry(field, x, y, z, live, shape)
+    return tl.split(tl.load(field.table + at, there, 0.0))
+
+
+@triton.jit
+def gather(field, at, fraction, live, shape: tl.constexpr):
+    """Trilinear features of all levels: even [P, width] and odd [P, width]."""
+    fx, fy, fz = fraction
+    even, odd = tl.zeros_like(fx), tl.zeros_like(fx)
+    for c in tl.static_range(4):
+        share = (fy if c % 2 else 1 - fy) * (fz if c // 2 else 1 - fz)
+        even_0, odd_0 = corner(field, at[0][0], at[1][c % 2], at[2][c // 2], live, shape)
+        even_1, odd_1 = corner(field, at[0][1], at[1][c % 2], at[2][c // 2], live, shape)
+        even += share * (even_0 + fx * (even_1 - even_0))
+        odd += share * (odd_0 + fx * (odd_1 - odd_0))
+    return even, odd
+
+
+@triton.jit
+def pull(field, at, fraction, d_even, d_odd, live, shape: tl.constexpr):
+    """Gradient by the position x, y, z, per metre [P] each, from that of the features. Reads the table again: the
+    cache still has it, and the six derivatives kept instead would not fit the registers."""
+    fx, fy, fz = fraction
+    gx, gy, gz = tl.zeros_like(fx), tl.zeros_like(fx), tl.zeros_like(fx)
+    for c in tl.static_range(4):
+        wy = fy if c % 2 else 1 - fy
+        wz = fz if c // 2 else 1 - fz
+        even_0, odd_0 = corner(field, at[0][0], at[1][c % 2], at[2][c // 2], live, shape)
+        even_1, odd_1 = corner(field, at[0][1], at[1][c % 2], at[2][c // 2], live, shape)
+        start = even_0 * d_even + odd_0 * d_odd
+        across = even_1 * d_even + odd_1 * d_odd - start
+        middle = start + fx * across
+        gx += wy * wz * across
+        gy += (wz if c % 2 else -wz) * middle
+        gz += (wy if c // 2 else -wy) * middle
+    level = tl.arange(0, shape.width)
+    inverse = tl.load(field.inverse + 2 * level, level < shape.levels, 0.0)[None, :]
+    return tl.sum(gx * inverse, 1), tl.sum(gy * inverse, 1), tl.sum(gz * inverse, 1)
+
+
+@triton.jit
+def scatter(field, into, at, fraction, d_even, d_odd, live, shape: tl.constexpr):
+    """Add the gradients of both features to the eight corners of the table's gradient ``into``."""
+    fx, fy, fz = fraction
+    for c in tl.static_range(8):
+        share = (fx if c % 2 else 1 - fx) * (fy if c // 2 % 2 else 1 - fy) * (fz if c // 4 else 1 - fz)
+        place, there = entry(field, at[0][c % 2], at[1][c // 2 % 2], at[2][c // 4], live, shape)
+        there = there & (tl.arange(0, 2) >= 0)[None, None, :]
+        tl.atomic_add(into + place, tl.join(share * d_even, share * d_odd), there, sem="relaxed")
+
+
+@triton.jit
+def rise(t):
+    """Integral of the quartic kernel from -1 to t."""
+    t = tl.minimum(tl.maximum(t, -1.0), 1.0)
+    return 0.9375 * t * (1 - t * t * (2 / 3 - 0.2 * t * t)) + 0.5
+
+
+@triton.jit
+def quartic(t):
+    """The kernel itself."""
+    rest = tl.maximum(1 - t * t, 0.0)
+    return 0.9375 * rest * rest
+
+
+@triton.jit
+def one_blob(phase, shape: tl.constexpr):
+    """One axis' one-blob values [P, blobs] and their derivatives by the phase; four bins or more, so that the kernel
+    meets each bin once."""
+    bins = tl.arange(0, shape.blobs)
+    t = bins[None, :] + 0.5 - phase[:, None]
+    t = tl.where(t > shape.bins / 2, t - shape.bins, t)
+    t = tl.where(t < -shape.bins / 2, t + shape.bins, t)
+    there = (bins < shape.bins)[None, :]
+    value = tl.where(there, rise(t + 0.5) - rise(t - 0.5), 0.0)
+    return value, tl.where(there, quartic(t - 0.5) - quartic(t + 0.5), 0.0)
+
+
+@triton.jit
+def place(field, world, shape: tl.constexpr):
+    """Points at world positions (x, y, z: float64 [P] each): what their corners add to row numbers, fractions within
+    the cells, one-blob phases, and which coordinates were inside the box."""
+    x, x_rest, in_x, phase_x = on_box(field, world[0], 0, shape)
+    y, y_rest, in_y, phase_y = on_box(field, world[1], 1, shape)
+    z, z_rest, in_z, phase_z = on_box(field, world[2], 2, shape)
+    fx, at_x = locate(field, x, x_rest, 0, 1, shape)
+    fy, at_y = locate(field, y, y_rest, 1, PRIME_Y, shape)
+    fz, at_z = locate(field, z, z_rest, 2, PRIME_Z, shape)
+    return (at_x, at_y, at_z), (fx, fy, fz), (phase_x, phase_y, phase_z), (in_x, in_y, in_z)

@@ -1,0 +1,223 @@
+"""The fused GPU back end (Triton): kernels over blocks of points and of rays.
+
+A step is five launches: clear; encode and decode; render, compare and differentiate; decoders back; grid back. In
+between lie TSDF, colour and the grid's features, later their gradients, which a GPU's cache holds. No launch waits for
+the host, sizes depend on shapes alone and memory comes from torch, so a CUDA graph can record whole loops
+(``graphs``). Sums are taken by atomics in varying order: results vary in their last digits.
+
+With TRITON_INTERPRET=1 the same code runs in Triton's interpreter on the CPU, for the tests.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
+
+if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
+    raise ImportError("no CUDA device")
+
+from ._gpu_align import SUMS, align_kernel, gradients_kernel
+from ._gpu_field import Field, Shape
+from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, values_kernel
+from ._gpu_rays import Targets, losses_kernel, render_kernel
+
+BLOCK = 64  # points; one matrix product's rows
+RAY_ELEMENTS = 512  # padded samples that one program renders
+KEPT_LAYOUTS = 8
+PROGRAMS_A_PROCESSOR = 2
+
+_layouts: dict[tuple[int, torch.device], tuple[GridLayout, tuple[Tensor, Tensor, Tensor]]] = {}
+
+
+def _on_device(layout: GridLayout, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """The layout as ``Field`` has it. Kept for the last few layouts: uploading waits, and no graph could record it."""
+    key = (id(layout), device)
+    held = _layouts.get(key)
+    if held is not None and held[0] is layout:
+        return held[1]
+    columns = [layout.offset[:, None], layout.size[:, None] - 1, layout.first, layout.dims]
+    geometry = [layout.anchor, layout.blob_low, 1 / layout.blob_size.double(), layout.box[0], layout.box[1]]
+    inverse = 1 / layout.voxel.double()
+    made = (
+        torch.cat(columns, 1).to(torch.int32).to(device),
+        torch.stack([inverse.float(), (inverse - inverse.float()).float()], 1).to(device),
+        torch.cat([part.double() for part in geometry]).to(device),
+    )
+    for old in list(_layouts)[: max(0, len(_layouts) + 1 - KEPT_LAYOUTS)]:
+        _layouts.pop(old, None)
+    _layouts[key] = (layout, made)
+    return made
+
+
+def _flat(tensor: Tensor) -> Tensor:
+    return tensor.detach().to(torch.float32).contiguous()
+
+
+def _field(layout: GridLayout, params: FieldParams) -> Field:
+    learnt = (_flat(t) for t in (params.table, params.w_in, params.w_sdf, params.w_rgb))
+    return Field(*_on_device(layout, params.table.device), *learnt)
+
+
+def _padded(count: int, least: int) -> int:
+    return max(least, 1 << max(count - 1, 0).bit_length())
+
+
+def _shape(layout: GridLayout) -> Shape:
+    return Shape(layout.levels, _padded(layout.levels, 16), layout.bins, _padded(layout.bins, 16))
+
+
+def _places(points: Tensor, c2w: Tensor | None = None) -> Points:
+    """Points given by their positions: in the world, or in one camera of ``c2w`` [3 or 4, 4]."""
+    place = _flat(points)
+    return Points(place, place if c2w is None else _flat(c2w), place, place, place, 0, 0, place.shape[0])
+
+
+def _samples(c2w: Tensor, rays: RayBatch) -> Points:
+    poses, z = _flat(c2w), _flat(rays.z)
+    return Points(z, poses, _flat(rays.direction), z, rays.pose.contiguous(), 4 * poses.shape[1], z.shape[1], z.numel())
+
+
+def _targets(rays: RayBatch) -> Targets:
+    feature = rays.feature.contiguous().view(torch.uint8)
+    return Targets(_flat(rays.z), _flat(rays.depth), _flat(rays.color), feature, *rays.z.shape)
+
+
+def _blocks(count: int) -> int:
+    return -(-count // BLOCK)
+
+
+def _ray_grid(rays: int, samples: int) -> tuple[tuple[int], dict[str, int]]:
+    """How many programs render so many rays, and the sizes each is compiled for."""
+    padded = _padded(samples, 1)
+    block = max(1, RAY_ELEMENTS // padded)
+    return (-(-rays // block),), {"block": block, "padded": padded}
+
+
+def _processors(device: torch.device) -> int:
+    return torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
+
+
+def _beside(tensor: Tensor) -> AbstractContextManager[Any]:
+    """Triton launches on the current device: make it the tensor's."""
+    return torch.cuda.device(tensor.device) if tensor.is_cuda else nullcontext()
+
+
+def _evaluate(
+    layout: GridLayout, field: Field, points: Points, from_rays: bool, features: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """TSDF [N] and colour [N, 3]; the grid features go into ``features`` [N, 2 L], if given."""
+    sdf, rgb = points.position.new_empty(points.total), points.position.new_empty(points.total, 3)
+    if points.total:
+        values_kernel[(_blocks(points.total),)](
+            field, points, sdf, rgb, sdf if features is None else features,
+            from_rays=from_rays, keep=features is not None, shape=_shape(layout), block=BLOCK,
+        )  # fmt: skip
+    return sdf, rgb
+
+
+def values(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor]:
+    """See ``reference.values``."""
+    with _beside(points):
+        return _evaluate(layout, _field(layout, params), _places(points), False)
+
+
+def gradients(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See ``reference.gradients``."""
+    n, given = points.shape[0], _places(points)
+    new = given.position.new_empty
+    found = new(n), new(n, 3), new(n), new(n, 3)
+    if n:
+        with _beside(points):
+            gradients_kernel[(_blocks(n),)](_field(layout, params), given, *found, shape=_shape(layout), block=BLOCK)
+    return found
+
+
+def render(layout: GridLayout, params: FieldParams, c2w: Tensor, rays: RayBatch) -> tuple[Tensor, Tensor, Tensor]:
+    """See ``reference.render``."""
+    targets = _targets(rays)
+    z = targets.z
+    color, depth, weights = z.new_zeros(targets.rays, 3), z.new_zeros(targets.rays), torch.zeros_like(z)
+    if z.numel():
+        grid, sizes = _ray_grid(targets.rays, targets.samples)
+        with _beside(z):
+            sdf, rgb = _evaluate(layout, _field(layout, params), _samples(c2w, rays), True)
+            render_kernel[grid](targets, sdf, rgb, _flat(params.beta), color, depth, weights, **sizes)
+    return color, depth, weights
+
+
+def step(
+    layout: GridLayout,
+    params: FieldParams,
+    c2w: Tensor,
+    rays: RayBatch,
+    weights: Weights,
+    into: FieldParams | None,
+    want_poses: bool,
+) -> StepResult:
+    """See ``reference.step``. Never waits for the device."""
+    targets, poses = _targets(rays), c2w.shape[0]
+    out = targets.z.new_empty(5 + 12 * poses)
+    losses, d_c2w = out[:5], out[5:].view(poses, 3, 4)
+    learnt = [] if into is None else [into.table, into.w_in, into.w_sdf, into.w_rgb, into.beta]
+    with _beside(out):
+        torch._foreach_zero_([out, *learnt])
+        if targets.z.numel():
+            _step(layout, params, _samples(c2w, rays), targets, weights, into, losses, d_c2w if want_poses else None)
+    return StepResult(losses, d_c2w if want_poses else None)
+
+
+def _step(
+    layout: GridLayout,
+    params: FieldParams,
+    points: Points,
+    targets: Targets,
+    weights: Weights,
+    into: FieldParams | None,
+    losses: Tensor,
+    d_c2w: Tensor | None,
+) -> None:
+    """Add to ``losses``, to ``into`` and to ``d_c2w``, where they are wanted."""
+    field, beta, shape = _field(layout, params), _flat(params.beta), _shape(layout)
+    features = beta.new_empty(points.total, 2 * layout.levels)
+    sdf, rgb = _evaluate(layout, field, points, True, features)
+    grid, sizes = _ray_grid(targets.rays, targets.samples)
+    numbers = tuple(float(getattr(weights, name)) for name in Weights.__dataclass_fields__)
+    d_beta = beta if into is None else into.beta
+    losses_kernel[grid](targets, sdf, rgb, beta, numbers, losses, d_beta, want_beta=into is not None, **sizes)
+    if into is None and d_c2w is None:
+        return
+    wanted = {"want_params": into is not None, "want_poses": d_c2w is not None}
+    sink = Into(*(getattr(into or params, name) for name in Into._fields))
+    blocks, d_world = _blocks(points.total), beta.new_empty(points.total, 3)
+    programs = blocks if into is None else min(blocks, PROGRAMS_A_PROCESSOR * _processors(losses.device))
+    decoders_kernel[(programs,)](
+        field, points, sdf, rgb, features, d_world, sink, blocks, **wanted, shape=shape, block=BLOCK
+    )
+    unused = losses
+    grid_kernel[(blocks,)](
+        field, points, features, d_world, sink, unused if d_c2w is None else d_c2w, **wanted, shape=shape, block=BLOCK
+    )
+
+
+def normal_equations(
+    layout: GridLayout, params: FieldParams, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
+) -> NormalEquations:
+    """See ``reference.normal_equations``. Waits once, for the sums: they go to the CPU, where ``align`` solves."""
+    n = points.shape[0]
+    sums = torch.zeros(SUMS, dtype=torch.float64, device=points.device)
+    if n:
+        numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
+        with _beside(points):
+            align_kernel[(_blocks(n),)](
+                _field(layout, params), _places(points, c2w), _flat(luminance), numbers, sums,
+                colour=settings.colour_weight > 0, shape=_shape(layout), block=BLOCK,
+            )  # fmt: skip
+    total = sums.cpu()
+    products, (cost, used, inliers) = total[:64].view(8, 8), total[64:].tolist()
+    return NormalEquations(products[:6, :6].clone(), products[:6, 6].clone(), cost, int(used), int(inliers))
