@@ -1,0 +1,93 @@
+"""Whole loops in one launch: a function of tensors, recorded as a CUDA graph and replayed.
+
+Launching costs more than computing for the small kernels of a SLAM loop. A graph repeats the recorded launches with the
+recorded addresses, so what is recorded must not wait for the host, must not make tensors from Python numbers on the
+host, and must take the same way whatever the values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+Tensors = tuple[Tensor, ...]
+Capture = Callable[[Callable[[], Tensors], torch.device], tuple[Callable[[], None], Tensors]]
+
+
+@dataclass
+class _Held:
+    """What is kept for one key: objects whose addresses a graph holds and, once recorded, its inputs and outputs."""
+
+    over: tuple[object, ...]
+    inputs: Tensors = ()
+    outputs: Tensors = ()
+    replay: Callable[[], None] | None = None
+
+
+def capture_cuda(function: Callable[[], Tensors], device: torch.device) -> tuple[Callable[[], None], Tensors]:
+    """Record ``function`` without running it: how to replay it, and where its results then lie.
+
+    Only this thread's calls count as forbidden ones: tracking and mapping may use the device at the same time.
+    """
+    with torch.cuda.device(device):
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            outputs = function()
+    return graph.replay, outputs
+
+
+class Recorder:
+    """Calls ``function``, and from the second call with the same sizes on replays it as a CUDA graph.
+
+    The first call runs plainly, which also compiles kernels and fills caches, so nothing runs that was not asked for
+    and a function may change what it holds in place. Without CUDA, or once recording has failed, every call is plain;
+    ``failure`` then says why. Results are copies. ``keep`` graphs are kept, the least recently used go first.
+    """
+
+    def __init__(self, function: Callable[..., Tensors], keep: int = 4, capture: Capture | None = None) -> None:
+        self.failure = ""
+        self._function, self._keep, self._capture = function, keep, capture
+        self._held: dict[Hashable, _Held] = {}
+
+    def __call__(self, *inputs: Tensor, key: Hashable = None, over: tuple[object, ...] = ()) -> Tensors:
+        """The function's results for ``inputs`` (at least one).
+
+        key: everything else that decides what is launched, by value. over: objects that hold the tensors which the
+        function reads or changes without being given them; another object means another graph.
+        """
+        device = inputs[0].device
+        if self.failure or not (self._capture or device.type == "cuda"):
+            return self._function(*inputs)
+        sizes = tuple((t.shape, t.dtype, t.device) for t in inputs)
+        whole = (key, sizes, tuple(id(held) for held in over))
+        held = self._held.pop(whole, None)
+        if held is None:
+            self._remember(whole, _Held(over))
+            return self._function(*inputs)
+        self._remember(whole, held)
+        if held.replay is None and not self._record(held, inputs, device):
+            return self._function(*inputs)
+        assert held.replay is not None
+        for mine, given in zip(held.inputs, inputs, strict=True):
+            mine.copy_(given)
+        held.replay()
+        return tuple(t.clone() for t in held.outputs)
+
+    def _remember(self, whole: Hashable, held: _Held) -> None:
+        for oldest in list(self._held)[: max(0, len(self._held) + 1 - self._keep)]:
+            del self._held[oldest]
+        self._held[whole] = held
+
+    def _record(self, held: _Held, inputs: Tensors, device: torch.device) -> bool:
+        mine = tuple(t.clone() for t in inputs)
+        try:
+            held.replay, held.outputs = (self._capture or capture_cuda)(lambda: self._function(*mine), device)
+        except RuntimeError as error:
+            self.failure = f"no CUDA graph: {error}"
+            self._held.clear()
+            return False
+        held.inputs = mine
+        return True
