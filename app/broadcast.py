@@ -18,6 +18,7 @@ import msgspec
 import viser
 import viser.infra._infra as infra
 import zstandard
+from viser._messages import FileTransferPart
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 from viser.infra._messages import Message
 
@@ -74,6 +75,12 @@ async def send_batches(
             await websocket.send(_packer.shared(batch) if buffer.persistent_messages else pack(batch))
     finally:
         await batches.aclose()
+
+
+def downloading(client: viser.ClientHandle) -> bool:
+    """Whether parts of a file wait to be sent to a viewer; they stay in memory until then."""
+    waiting = list(client._websock_connection.get_message_buffer().message_from_id.values())
+    return any(isinstance(message, FileTransferPart) for message in waiting)
 
 
 def share_batches() -> None:

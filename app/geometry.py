@@ -6,7 +6,12 @@ import numpy as np
 import viser.transforms as vt
 from numpy.typing import NDArray
 
+from ecslam.types import Mesh
+
 Array = NDArray[np.float64]
+# Lower left and upper right corner of the part of the picture to fill, each axis from -1 to 1.
+_SCREEN = np.array([-0.94, -0.94]), np.array([0.94, 0.94])
+_PHONE = np.array([-0.94, 0.02]), np.array([0.94, 0.8])
 
 
 def wxyz(c2w: Array) -> Array:
@@ -66,24 +71,54 @@ def rotation_to(up: Array) -> Array:
     return np.asarray(vt.SO3.exp(axis).wxyz)
 
 
-def overview(low: Array, high: Array, up: Array, aspect: float, fov_y: float) -> tuple[Array, Array]:
-    """Position and look-at point from which the box low..high is seen whole, obliquely from above."""
-    centre = (low + high) / 2
-    side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
-    side /= np.linalg.norm(side)
-    away = 0.52 * side + 0.33 * np.cross(up, side) + 0.79 * up
-    radius = max(float(np.linalg.norm(high - low)) / 2, 0.5)
-    half = np.arctan(np.tan(fov_y / 2) * min(1.0, aspect))
-    away *= radius / np.sin(half) * 0.82 / np.linalg.norm(away)
-    if aspect < 0.8:  # a phone, whose lower half is covered by the controls
-        centre = centre - 0.45 * np.linalg.norm(away) * np.tan(fov_y / 2) * _screen_up(up, away)
-    return centre + away, centre
+def overview(points: Array, up: Array, side: Array, aspect: float, fov_y: float) -> tuple[Array, Array]:
+    """Position and look-at point from which ``points`` [n, 3] fill the picture, seen obliquely from above.
+
+    side: horizontal direction [3] from what is seen towards the viewer; aspect: width over height. On a phone (aspect
+    below 0.8) the points fill the upper part, since the controls cover the rest.
+    """
+    back = 0.62 * side / np.linalg.norm(side) + 0.78 * up
+    back /= np.linalg.norm(back)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(back, right), back])
+    low, high = _PHONE if aspect < 0.8 else _SCREEN
+    middle, half, tangent = (high + low) / 2, (high - low) / 2, np.tan(fov_y / 2) * np.array([aspect, 1.0])
+    seen = points @ axes.T
+    centre, distance = (seen.min(0) + seen.max(0)) / 2, 0.1
+    for _ in range(4):  # nearer points take more room, so where the middle lies depends on the distance
+        local = seen - centre
+        reach = np.abs(local[:, :2]) / (tangent * half) + local[:, 2:]
+        distance = max(float(reach.max()), 0.1)
+        spread = local[:, :2] / (distance - local[:, 2:]).clip(1e-3)
+        centre[:2] += (spread.min(0) + spread.max(0)) / 2 * distance
+    centre[:2] -= middle * tangent * distance
+    return (centre + np.array([0, 0, distance])) @ axes, centre @ axes
 
 
-def _screen_up(up: Array, away: Array) -> Array:
-    back = away / np.linalg.norm(away)
-    upward = up - (up @ back) * back
-    return np.asarray(upward / np.linalg.norm(upward))
+def first_side(c2w: Array, up: Array) -> Array:
+    """The horizontal direction [3] from what the first of poses [n, 4, 4] sees back to its camera."""
+    back = -c2w[0, :3, 2] if len(c2w) else np.zeros(3)
+    back = back - (back @ up) * up
+    length = np.linalg.norm(back)
+    return np.asarray(back / length if length > 0.1 else np.cross(up, [up[2], up[0], up[1]]))
+
+
+def best_side(mesh: Mesh, up: Array, before: Array | None = None) -> Array:
+    """The horizontal direction [3] from which, looking down obliquely, most of a mesh's front faces are in sight.
+
+    before: the direction chosen last; it stays while it is nearly as good.
+    """
+    faces = mesh.faces[:: max(1, len(mesh.faces) // 20_000)]
+    a, b, c = (mesh.vertices[faces[:, k]].astype(float) for k in range(3))
+    normals = np.cross(b - a, c - a)
+    first = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
+    first /= np.linalg.norm(first)
+    angles = np.radians(33.0 + 45.0 * np.arange(8))[:, None]
+    sides = np.cos(angles) * first + np.sin(angles) * np.cross(up, first)
+    sides = sides if before is None else np.concatenate([before[None], sides])
+    area = (normals @ (0.62 * sides + 0.78 * up).T).clip(0).sum(0)
+    return np.asarray(sides[0] if before is not None and area[0] > 0.85 * area.max() else sides[np.argmax(area)])
 
 
 def behind(c2w: Array, up: Array, distance: float = 1.1) -> tuple[Array, Array]:

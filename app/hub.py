@@ -32,10 +32,12 @@ from ecslam.messages import (
 from ecslam.runtime.protocol import EngineHandle
 
 from . import theme
+from .broadcast import downloading
 from .history import History
 from .panel import TABS, BasePanel, find_panels
 from .replay import ReplayEngine
 from .scene import Scene
+from .views import Views
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +53,7 @@ class Hub:
     def __init__(self, engine: EngineHandle, server: viser.ViserServer, dark: bool) -> None:
         self.engine, self.server, self.dark = engine, server, dark
         self.scene = Scene(server, self._keyframe_clicked)
+        self.views = Views(server, self.scene)
         self.replay = engine if isinstance(engine, ReplayEngine) else None
         self.history = History() if self.replay is None else self.replay.history
         self.current: Snapshot | None = None
@@ -62,7 +65,6 @@ class Hub:
         self._subscription = engine.subscribe()
         self._newest: Snapshot | None = None
         self._newest_lock = threading.Lock()
-        self._seen_mesh = False
         self._noticed = 0.0
         self._closing = False
         self.panels: list[BasePanel] = []
@@ -111,6 +113,7 @@ class Hub:
             control_width="large",
             brand_color=theme.ACCENT,
         )
+        self.scene.set_dark(self.dark)
 
     # ---- what panels use -----------------------------------------------------------------------------------------
 
@@ -162,6 +165,9 @@ class Hub:
             return
         if size > DOWNLOAD_LIMIT:
             self.toast("Saved", f"{text}; too large to download here", "yellow", client)
+            return
+        if downloading(client):
+            self.toast("Saved", f"{text}; not downloaded, as the last file is still on its way", "yellow", client)
             return
         client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
         self.toast("Saved", text, "green", client)
@@ -227,15 +233,14 @@ class Hub:
                 panel.snapshot(s)
         if self.follow and len(s.trajectory):
             for client in self.viewers():
-                self.scene.follow(client, s.trajectory[-1])
+                self.views.follow(client, s.trajectory[-1])
 
     def _begin(self, s: Snapshot) -> None:
         if self.replay is None:
             self.history = History()
         self.scene.begin(s)
-        self._seen_mesh = False
         for client in self.viewers():
-            self.scene.show_all(client, 0.0)
+            self.views.show_all(client, 0.0)
 
     def _tell(self, message: Event | Ack) -> None:
         if isinstance(message, Ack):
@@ -243,10 +248,7 @@ class Hub:
             return
         if isinstance(message, MeshReady):
             self.scene.set_mesh(message)
-            if not self._seen_mesh:
-                self._seen_mesh = True
-                for client in self.viewers():
-                    self.scene.show_all(client)
+            self.views.keep_framed()
         elif isinstance(message, Exported):
             self.jobs.submit(self.deliver, self._askers.pop(message.command_id or -1, None), Path(message.path))
         elif isinstance(message, Notice):
@@ -275,7 +277,7 @@ class Hub:
     # ---- browsers ------------------------------------------------------------------------------------------------
 
     async def _connected(self, client: viser.ClientHandle) -> None:
-        self.post(partial(self.scene.show_all, client, 0.0))
+        self.post(partial(self.views.welcome, client))
 
     def _keyframe_clicked(self, client: viser.ClientHandle, index: int) -> None:
         self.post(partial(self._visit, client, index))
@@ -284,6 +286,6 @@ class Hub:
         if self.current is None or index >= len(self.current.keyframes):
             return
         keyframe = self.current.keyframes[index]
-        self.scene.visit(client, keyframe)
+        self.views.visit(client, keyframe.c2w)
         for panel in self.panels:
             panel.keyframe(keyframe)

@@ -13,6 +13,7 @@ from .front import bind, close_viser, open_viser
 from .geometry import overview
 from .history import History
 from .scene import Scene
+from .views import FOV_RAD
 
 STEPS, SECONDS = 150, 12.0
 
@@ -23,12 +24,12 @@ def html_replay(s: Snapshot, mesh: Mesh | None, history: History, dark: bool) ->
     try:
         scene = Scene(server)
         scene.begin(s)
+        scene.set_dark(dark)
         if mesh is not None:
             scene.set_mesh(MeshReady(s.frame, 0.0, mesh))
-        low, high = scene.bounds
-        position, look_at = overview(low, high, scene.up, 1.5, 1.2)
+        position, look_at = overview(scene.points, scene.up, scene.side, 1.5, FOV_RAD)
         server.initial_camera.position, server.initial_camera.look_at = tuple(position), tuple(look_at)
-        server.initial_camera.fov = 1.2
+        server.initial_camera.fov = FOV_RAD
         serializer = server.get_scene_serializer()
         for count in np.unique(np.linspace(1, len(s.trajectory), min(STEPS, len(s.trajectory))).astype(int)):
             scene.update(_until(s, int(count), history))

@@ -153,6 +153,7 @@ class ReplayEngine:
         keyframes = tuple(
             replace(k, c2w=trajectory[at]) for k, at in zip(run.keyframes, self._past.keyframes, strict=True) if at <= i
         )
+        mapped = next((r for r in run.rows[i::-1] if r.get("window")), row)
         thumbnail = keyframes[-1].thumbnail if keyframes and keyframes[-1].thumbnail.any() else None
         return Snapshot(
             state=state,
@@ -163,13 +164,13 @@ class ReplayEngine:
             trajectory=trajectory,
             trajectory_gt=run.trajectory_gt,
             keyframes=keyframes,
-            window=tuple(row.get("window") or self.history.window_at(frame)),
+            window=tuple(mapped.get("window") or ()),
             color=thumbnail,
             fov_y_rad=run.fov_y_rad,
             aspect=run.aspect,
             losses=dict(row.get("losses") or {}),
             track_ms=float(row.get("track_ms") or 0),
-            map_ms=float(row.get("map_ms") or 0),
+            map_ms=float(mapped.get("map_ms") or 0),
             fps_wall=float(run.summary.get("fps_wall") or 0),
             fps_engine=float(run.summary.get("fps_engine") or 0),
             ate_cm=row.get("ate_cm"),

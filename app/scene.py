@@ -5,7 +5,6 @@ Every node is made once and updated in place. Only the hub's thread calls these 
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from typing import Any
 
@@ -13,16 +12,16 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from ecslam.messages import KeyframeView, LoopEvent, MeshReady, Snapshot
+from ecslam.messages import LoopEvent, MeshReady, Snapshot
 from ecslam.types import Mesh
 
 from . import theme
 from .geometry import (
     FRUSTUM_FACES,
-    behind,
+    best_side,
+    first_side,
     frustum_corners,
     frustum_lines,
-    overview,
     polyline,
     rotation_to,
     up_direction,
@@ -31,13 +30,17 @@ from .geometry import (
 from .glb import simplify, to_glb, vertex_normals
 
 MESH_MODES = ("Colour", "Normals", "Wireframe", "Off")
-FRUSTUM_M = 0.13
+FRUSTUM_M, CAMERA_M = 0.09, 0.28
 LINKS_LAST_FRAMES = 15
+SAMPLE = 2000
 _NO_LINES = np.zeros((0, 2, 3), np.float32)
 
 
 class Scene:
-    """Draws snapshots on a viser server. ``on_keyframe(client, index)`` is called when a frustum is clicked."""
+    """Draws snapshots on a viser server. ``on_keyframe(client, index)`` is called when a frustum is clicked.
+
+    points: [n, 3] metres, a sample of what there is to see.
+    """
 
     def __init__(self, server: viser.ViserServer, on_keyframe: Callable[[Any, int], None] | None = None) -> None:
         self._server = server
@@ -46,11 +49,14 @@ class Scene:
         self._mesh: Mesh | None = None
         self._mesh_handle: viser.GlbHandle | None = None
         self._frusta: viser.BatchedMeshHandle | None = None
+        self._keyframes_wanted = True
         self._camera: viser.CameraFrustumHandle | None = None
         self._inspected: LoopEvent | None = None
         self._inspected_window: tuple[int, ...] = ()
-        self._bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        self.up = np.array([0.0, 0.0, 1.0])
+        self._walked = np.zeros((1, 3))
+        self.points = np.array([[-1.0, -1, -1], [1, 1, 1]])
+        self.up, self._back = np.array([0.0, 0.0, 1.0]), np.array([0.8, -0.6, 0.0])
+        self._best_side: NDArray[np.float64] | None = None
         self.fov_y, self.aspect = 0.9, 4 / 3
         server.scene.configure_default_lights(cast_shadow=False)
         self._grid = server.scene.add_grid(
@@ -59,8 +65,8 @@ class Scene:
             24,
             cell_size=0.5,
             section_size=2.0,
-            cell_color=theme.KEYFRAME,
-            section_color=theme.KEYFRAME,
+            cell_color=theme.GRID[0],
+            section_color=theme.GRID[0],
             cell_thickness=0.5,
             section_thickness=0.8,
             fade_distance=22,
@@ -87,23 +93,26 @@ class Scene:
         return self._mesh
 
     @property
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Corners of what there is to see, in metres."""
-        return self._bounds or (np.full(3, -1.0), np.full(3, 1.0))
+    def side(self) -> NDArray[np.float64]:
+        """The horizontal direction [3] from what there is to see towards where it is seen best."""
+        return self._back if self._best_side is None else self._best_side
 
     # ---- what is drawn -------------------------------------------------------------------------------------------
 
-    def begin(self, snapshot: Snapshot) -> None:
+    def begin(self, s: Snapshot) -> None:
         """Take the up direction and the camera's shape from a run's first snapshot, and forget the last run."""
-        poses = snapshot.trajectory if snapshot.trajectory_gt is None else snapshot.trajectory_gt
+        poses = s.trajectory if s.trajectory_gt is None else s.trajectory_gt
         self.up = up_direction(poses)
-        self.fov_y, self.aspect = snapshot.fov_y_rad, snapshot.aspect
+        self.fov_y, self.aspect = s.fov_y_rad, s.aspect
         self._inspected, self._mesh = None, None
+        self._lines["trajectory/before the loop"].points = _NO_LINES
         self._server.scene.set_up_direction(tuple(self.up))
         if self._mesh_handle is not None:
             self._mesh_handle.visible = False
         centres = poses[np.isfinite(poses).all((1, 2)), :3, 3]
-        self._bounds = (centres.min(0) - 1.0, centres.max(0) + 1.0) if len(centres) else None
+        self._walked = centres[:: max(1, len(centres) // SAMPLE)] if len(centres) else np.zeros((1, 3))
+        self.points = np.concatenate([self._walked - 1.0, self._walked + 1.0])
+        self._back, self._best_side = first_side(s.trajectory, self.up), None
         self._grid.wxyz = rotation_to(self.up)
         self._grid.position = (centres.mean(0) if len(centres) else np.zeros(3)) - 1.5 * self.up
 
@@ -128,16 +137,20 @@ class Scene:
     def show_mesh(self, mesh: Mesh) -> None:
         """Put ``mesh`` in the place of the one on show."""
         self._mesh = simplify(mesh)
-        low, high = np.percentile(self._mesh.vertices, (1, 99), axis=0).astype(float)
-        self._bounds = (low, high)
-        middle = (low + high) / 2
-        reach = float(((self._mesh.vertices - middle) @ self.up).min())
-        self._grid.position = middle + (reach - 0.02) * self.up
+        self._best_side = best_side(self._mesh, self.up, self._best_side)
+        low, high = np.percentile(self._mesh.vertices, (1, 99), axis=0)
+        some = self._mesh.vertices[:: max(1, len(self._mesh.vertices) // SAMPLE)].astype(float)
+        self.points = np.concatenate([some.clip(low, high), self._walked])
+        self._grid.position = (low + high) / 2 + (float(((some - (low + high) / 2) @ self.up).min()) - 0.02) * self.up
         self._draw_mesh()
 
     def compare(self, centres: NDArray[np.float64]) -> None:
         """Draw another run's camera centres [n, 3] beside this one's."""
         self._lines["trajectory/other run"].points = polyline(centres)
+
+    def set_dark(self, dark: bool) -> None:
+        """Draw the floor's grid for a dark or a light page."""
+        self._grid.cell_color = self._grid.section_color = theme.GRID[dark]
 
     def set_mode(self, mode: str) -> None:
         """Show the mesh as one of ``MESH_MODES``."""
@@ -155,8 +168,10 @@ class Scene:
         for key, lines in self._lines.items():
             if key.startswith(name):
                 lines.visible = visible
-        if name == "keyframes" and self._frusta is not None:
-            self._frusta.visible = visible
+        if name == "keyframes":
+            self._keyframes_wanted = visible
+            if self._frusta is not None:
+                self._frusta.visible = visible and self._inspected is None
 
     def _draw_mesh(self) -> None:
         if self._mode == "Off" or self._mesh is None:
@@ -175,7 +190,8 @@ class Scene:
         poses = np.array([k.c2w for k in s.keyframes]).reshape(-1, 4, 4)
         window = s.window if self._inspected is None else (*self._inspected_window, *self._inspected.keyframes)
         chosen = np.isin([k.frame for k in s.keyframes], window)
-        for name, some in (("all", poses[~chosen]), ("window", poses[chosen])):
+        others = poses[~chosen] if self._inspected is None else poses[:0]
+        for name, some in (("all", others), ("window", poses[chosen])):
             self._lines[f"keyframes/{name}"].points = frustum_lines(some, s.fov_y_rad, s.aspect, FRUSTUM_M)
         if len(poses) == 0:
             return
@@ -188,7 +204,7 @@ class Scene:
                 wxyz(poses),
                 poses[:, :3, 3],
                 batched_colors=colors,
-                opacity=0.22,
+                opacity=0.14,
                 side="double",
                 lod="off",
                 cast_shadow=False,
@@ -200,6 +216,7 @@ class Scene:
             self._frusta.batched_wxyzs = wxyz(poses).astype(np.float32)
             self._frusta.batched_positions = poses[:, :3, 3].astype(np.float32)
             self._frusta.batched_colors = colors
+        self._frusta.visible = self._keyframes_wanted and self._inspected is None
 
     async def _clicked(self, event: Any) -> None:
         if event.instance_index is not None and self._on_keyframe is not None:
@@ -208,13 +225,14 @@ class Scene:
     def _draw_camera(self, s: Snapshot) -> None:
         if len(s.trajectory) == 0:
             return
-        pose = s.trajectory[-1]
+        at = len(s.trajectory) - 1 if self._inspected is None else min(self._inspected.frame, len(s.trajectory) - 1)
+        pose = s.trajectory[at]
         if self._camera is None:
             self._camera = self._server.scene.add_camera_frustum(
                 "/camera",
                 s.fov_y_rad,
                 s.aspect,
-                scale=2.2 * FRUSTUM_M,
+                scale=CAMERA_M,
                 thickness=3.0,
                 thickness_units="screen",
                 color=theme.ESTIMATE,
@@ -224,8 +242,7 @@ class Scene:
             )
         self._camera.position = pose[:3, 3]
         self._camera.wxyz = wxyz(pose)
-        if s.color is not None:
-            self._camera.image = s.color
+        self._camera.image = s.color if self._inspected is None else None
 
     def _draw_loop(self, s: Snapshot) -> None:
         event = self._inspected
@@ -237,58 +254,6 @@ class Scene:
             old = [k.c2w[:3, 3] for k in s.keyframes if k.frame in event.keyframes]
             links = np.array([[here, there] for there in old], np.float32).reshape(-1, 2, 3)
         self._lines["loops/links"].points = links
-
-    # ---- where it is seen from -----------------------------------------------------------------------------------
-
-    def show_all(self, client: viser.ClientHandle, seconds: float = 0.6) -> None:
-        """Move one viewer to where the whole scene is in sight."""
-        if self._bounds is None:
-            return
-        self.show_box(client, *self._bounds, seconds)
-
-    def show_box(
-        self, client: viser.ClientHandle, low: NDArray[np.float64], high: NDArray[np.float64], seconds: float = 0.6
-    ) -> None:
-        """Move one viewer to where the box low..high is in sight."""
-        camera = client.camera
-        self.fly(client, *overview(low, high, self.up, camera.aspect or 1.5, camera.fov), seconds)
-
-    def follow(self, client: viser.ClientHandle, c2w: NDArray[np.float64]) -> None:
-        """Put one viewer just behind the camera."""
-        position, look_at = behind(c2w, self.up)
-        _place(client, position, look_at)
-
-    def visit(self, client: viser.ClientHandle, keyframe: KeyframeView) -> None:
-        """Fly one viewer to a keyframe."""
-        self.fly(client, *behind(keyframe.c2w, self.up, 0.45))
-
-    def fly(
-        self,
-        client: viser.ClientHandle,
-        position: NDArray[np.float64],
-        look_at: NDArray[np.float64],
-        seconds: float = 0.6,
-    ) -> None:
-        """Move one viewer smoothly."""
-        start = np.array(client.camera.position), np.array(client.camera.look_at)
-
-        async def glide() -> None:
-            steps = max(1, int(30 * seconds))
-            for step in range(1, steps + 1):
-                if client.client_id not in self._server.get_clients():
-                    return
-                t = step / steps
-                ease = t * t * (3 - 2 * t)
-                _place(client, start[0] + ease * (position - start[0]), start[1] + ease * (look_at - start[1]))
-                await asyncio.sleep(1 / 30)
-
-        asyncio.run_coroutine_threadsafe(glide(), self._server.get_event_loop())
-
-
-def _place(client: viser.ClientHandle, position: NDArray[np.float64], look_at: NDArray[np.float64]) -> None:
-    with client.atomic():
-        client.camera.position = position
-        client.camera.look_at = look_at
 
 
 def _mesh_colors(mesh: Mesh, mode: str) -> NDArray[np.uint8]:

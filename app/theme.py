@@ -15,6 +15,7 @@ LOOP: RGB = (16, 185, 129)
 BEFORE: RGB = (239, 68, 68)
 OTHER: RGB = (20, 184, 166)
 ACCENT: RGB = (234, 88, 12)
+GRID: tuple[RGB, RGB] = (214, 220, 228), (58, 64, 74)  # light, dark
 
 STATE_COLORS: dict[str, RGB] = {
     "idle": KEYFRAME,
@@ -35,6 +36,7 @@ def css(color: RGB) -> str:
 
 
 STYLE = """
+[style*="letter-spacing"]{letter-spacing:normal!important}
 .mantine-Tabs-tab{padding:9px 10px;font-size:13px}
 .mantine-Button-root{border-radius:7px;font-weight:600}
 .mantine-Button-root[style*="gray-filled"]{--button-bg:transparent!important;--button-hover:rgba(128,128,128,.12)!important;
@@ -42,7 +44,7 @@ STYLE = """
 @media (max-width:48em){.mantine-Paper-root[style*="bottom: 0px"]{width:100%!important;max-height:52%!important;
   border-radius:14px 14px 0 0!important}.mantine-Paper-root [style*="width: 20em"]{width:100%!important}}
 .u-legend .u-series:first-child,.u-legend .u-value{display:none!important}
-.u-legend .u-label:after{display:none!important}
+.u-legend th:after{content:none!important}
 .u-title{font-size:12.5px!important;font-weight:600}
 .ec{font-size:12.5px;line-height:1.45;color:var(--mantine-color-text);padding:4px 8px 6px;
   font-variant-numeric:tabular-nums}
@@ -94,10 +96,15 @@ def note(text: str, color: RGB) -> str:
     return f'<div class="ec-note" style="--c:{css(color)}">{escape(text)}</div>'
 
 
+def card(html: str) -> str:
+    """Wrap pieces for a panel of their own."""
+    return f'<div class="ec">{html}</div>'
+
+
 def legend(entries: list[tuple[str, RGB]]) -> str:
-    """What the colours in the scene mean."""
+    """What colours mean."""
     items = "".join(f'<span><i style="--c:{css(color)}"></i>{escape(name)}</span>' for name, color in entries)
-    return f'<div class="ec"><div class="ec-key">{items}</div></div>'
+    return f'<div class="ec-key">{items}</div>'
 
 
 def number(value: float | None, digits: int = 2) -> str:

@@ -15,7 +15,6 @@ from ecslam_app.panel import TABS, BasePanel, find_panels
 from ecslam_app.panels.status import WORDS, render
 
 from ecslam import messages as m
-from tests.conftest import ROOT
 from tests.fake_engine import FakeEngine, write_run
 from tests.test_app_security import control, dial, enter, press, until
 
@@ -153,51 +152,3 @@ def test_live_only_controls_are_absent_from_a_replay(replay_page):
 def test_dashboard_imports_no_torch():
     code = "import sys, ecslam_app.server, ecslam_app.panel as p; p.find_panels(); sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-READER = """
-import sys, time
-from websockets.sync.client import connect
-import threading, msgspec, viser
-from tests.test_app_security import CAMERA
-port, count = int(sys.argv[1]), int(sys.argv[2])
-def read():
-    with connect(f"ws://127.0.0.1:{port}/", origin=f"http://127.0.0.1:{port}",
-                 subprotocols=[f"viser-v{viser.__version__}"],
-                 max_size=None, compression=None) as c:
-        c.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **CAMERA}))
-        for _ in c: pass
-for _ in range(count): threading.Thread(target=read, daemon=True).start()
-print("ready", flush=True)
-time.sleep(60)
-"""
-
-
-@pytest.mark.slow
-def test_the_engine_goes_on_under_twenty_viewers(tmp_path):
-    """All are served and the engine moves on. How fast is printed, not asserted: rates depend on the machine."""
-    engine = FakeEngine(tmp_path / "run", frames=4000, period=0.02).start()
-    page = server.start(engine, port=0)
-
-    def rate(seconds=3.0):
-        first = engine.latest().frame
-        time.sleep(seconds)
-        return (engine.latest().frame - first) / seconds
-
-    time.sleep(1.5)
-    alone = rate()
-    readers = subprocess.Popen([sys.executable, "-c", READER, str(page.port), "20"], stdout=subprocess.PIPE, cwd=ROOT)
-    try:
-        readers.stdout.readline()
-        assert until(lambda: len(page.hub.server._websock_server._client_state_from_id) == 20, 30)
-        assert until(lambda: len(list(page.hub.viewers())) == 20, 30)
-        time.sleep(1)
-        watched = rate()
-        assert len(list(page.hub.viewers())) == 20
-    finally:
-        readers.kill()
-        readers.wait()
-        page.close()
-        engine.stop()
-    print(f"frames/s alone {alone:.1f}, with 20 viewers {watched:.1f}, ratio {watched / alone:.2f}")
-    assert watched > 0

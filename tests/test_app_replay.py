@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import zipfile
 
 import numpy as np
 import pytest
 import trimesh
 from ecslam_app import server
-from ecslam_app.geometry import overview, rotation_difference_deg, rotation_to, up_direction
+from ecslam_app.geometry import best_side, overview, rotation_difference_deg, rotation_to, up_direction
 from ecslam_app.glb import simplify, to_glb, vertex_normals
 from ecslam_app.history import History
+from ecslam_app.past import Past
 from ecslam_app.record import html_replay
 from ecslam_app.replay import ReplayEngine
 from ecslam_app.runs import kitti_lines, load_mesh, load_run, tum_lines
@@ -73,6 +75,48 @@ def test_scrubbing_shows_what_was_there_at_that_frame(replay, frame):
     assert all(k.frame <= at for k in s.keyframes)
     assert all(e.frame <= at for e in s.loops)
     assert set(s.window) <= {k.frame for k in s.keyframes}
+
+
+def test_past_poses_are_those_of_the_frame(folder):
+    """Every keyframe is moved by a known amount at row 6; what hangs on it moves along, and only from then on."""
+    rows = [dict(row, window=(), window_c2w=()) for row in load_run(folder).rows[:8]]
+    shift = np.eye(4)
+    shift[:3, 3] = 0.1, 0.2, 0.3
+    seen = np.tile(np.eye(4), (8, 1, 1))
+    seen[:, :3] = np.array([row["c2w"] for row in rows]).reshape(-1, 3, 4)
+    rows[6] |= {"window": [0, 5], "window_c2w": [(shift @ seen[k])[:3].ravel() for k in (0, 5)]}
+    final = seen + 1
+    past = Past(rows, final)
+    assert np.allclose(past.trajectory(5), seen[:6])
+    after = past.trajectory(6)
+    assert np.allclose(after[:6], shift @ seen[:6])
+    assert np.allclose(after[6], seen[6])
+    assert past.trajectory(7) is final
+
+
+def test_scrubbing_brings_the_mesh_of_that_time(folder, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    (run / "meshes").mkdir()
+    early = room_mesh(0.5)
+    trimesh.Trimesh(early.vertices, early.faces, vertex_colors=early.colors, process=False).export(
+        run / "meshes" / "000010.ply"
+    )
+    engine = ReplayEngine(load_run(run))
+    feed = engine.subscribe()
+
+    def faces_at(frame):
+        engine.submit(m.RunTo(frame))
+        while not isinstance(thing := feed.get(5), m.MeshReady):
+            assert thing is not None
+        return len(thing.mesh.faces)
+
+    try:
+        assert faces_at(20) == len(early.faces)
+        assert faces_at(FRAMES - 1) == len(room_mesh().faces)
+        assert faces_at(12) == len(early.faces)
+    finally:
+        engine.close()
 
 
 def test_play_runs_to_the_end_and_step_moves_by_one(replay):
@@ -177,16 +221,40 @@ def test_normals_of_a_sphere_point_outwards():
     assert np.allclose(vertex_normals(mesh), ball.vertices, atol=0.02)
 
 
-def test_up_is_found_and_the_first_view_shows_the_whole_box():
-    poses, low, high = walk(50), np.array([-3.0, -2, 0]), np.array([3.0, 2, 2.5])
-    up = up_direction(poses)
-    assert np.allclose(up, [0, 0, 1])
-    position, look_at = overview(low, high, up, 1.6, 1.3)
+def test_up_is_found():
+    assert np.allclose(up_direction(walk(50)), [0, 0, 1])
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 1.7])
+@pytest.mark.parametrize("side", [[1, 0, 0], [-0.6, 0.8, 0]])
+def test_overview_fills_the_picture_from_above(aspect, side):
+    corners = np.array(np.meshgrid([-3.0, 3], [-2.0, 2], [0.0, 2.5])).reshape(3, -1).T
+    up, fov = np.array([0.0, 0, 1]), 0.9
+    position, look_at = overview(corners, up, np.array(side, float), aspect, fov)
+    assert (position - look_at) @ side > 0
+    assert position[2] > 2.5
     forward = (look_at - position) / np.linalg.norm(look_at - position)
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - position
-    angles = np.degrees(np.arccos(corners @ forward / np.linalg.norm(corners, axis=1)))
-    assert angles.max() < np.degrees(np.arctan(np.tan(0.65) * np.hypot(1, 1.6)))
-    assert position[2] > high[2]
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    local = (corners - position) @ np.stack([right, np.cross(right, forward), forward]).T
+    screen = local[:, :2] / local[:, 2:] / (np.tan(fov / 2) * np.array([aspect, 1]))
+    lowest = 0.0 if aspect < 0.8 else -0.97
+    assert screen.min(0)[0] > -0.97
+    assert screen.max(0)[0] < 0.97
+    assert screen.min(0)[1] > lowest - 0.02
+    assert screen.max(0)[1] < 0.97
+    assert max(np.ptp(screen[:, 0]) / 1.88, np.ptp(screen[:, 1]) / (0.78 if aspect < 0.8 else 1.88)) > 0.9
+
+
+def test_a_wall_is_looked_at_from_its_front_and_the_choice_lasts():
+    wall = Mesh(
+        np.array([[0, -1, 0], [0, 1, 0], [0, 1, 1], [0, -1, 1]], np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    )
+    up = np.array([0.0, 0, 1])
+    side = best_side(wall, up)
+    assert side[0] > 0.7
+    turned = best_side(Mesh(wall.vertices, wall.faces[:, ::-1]), up)
+    assert turned[0] < -0.7
+    assert np.array_equal(best_side(room_mesh(0.3), up, side), side)
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, -1, 0], [0.6, 0, 0.8]])

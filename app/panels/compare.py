@@ -44,7 +44,8 @@ class Panel(BasePanel):
         assert hub.replay is not None
         gui, self._run, self._other = hub.server.gui, hub.replay.run, hub.replay.others[0]
         gui.add_html(figures_table(self._run, self._other))
-        gui.add_html(theme.legend([(self._run.name, theme.ESTIMATE), (self._other.name, theme.OTHER)]))
+        colors = [(self._run.name, theme.ESTIMATE), (self._other.name, theme.OTHER)]
+        gui.add_html(theme.card(theme.legend(colors)))
         self._shown = (self._run.name, self._other.name) if self._run.name != self._other.name else ("First", "Second")
         self._mesh_of = gui.add_button_group("Mesh of", self._shown)
         self._past = Past(self._other.rows, self._other.trajectory)

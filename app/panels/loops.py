@@ -15,6 +15,7 @@ from ..panel import BasePanel, put
 from .plots import Chart
 
 NONE = "None"
+AROUND = 1.35
 
 
 class Panel(BasePanel):
@@ -26,17 +27,14 @@ class Panel(BasePanel):
         super().__init__(hub)
         gui = hub.server.gui
         self._events: tuple[LoopEvent, ...] = ()
-        self._chart = Chart(hub, "Rotation error (°)", markers=True)
+        self._chart = Chart(hub, "Rotation error (°)", legend=False, markers=True)
         self._choice = gui.add_dropdown("Loop event", (NONE,), initial_value=NONE)
         hub.on(self._choice, lambda event: self._inspect(event.client))
         steps = gui.add_button_group("Go to", ("Previous event", "Next event"))
         hub.on(steps, lambda event: self._move(-1 if steps.value.startswith("Prev") else 1, event.client))
         self._html = gui.add_html(_intro())
-        gui.add_html(
-            theme.legend(
-                [("links", theme.LOOP), ("before", theme.BEFORE), ("after", theme.ESTIMATE), ("window", theme.WINDOW)]
-            )
-        )
+        colors = [("links", theme.LOOP), ("before", theme.BEFORE), ("after", theme.ESTIMATE), ("window", theme.WINDOW)]
+        gui.add_html(theme.card(theme.legend(colors)))
         if hub.replay is None:
             pause = gui.add_checkbox("Pause on loop closure", False)
             hub.on(pause, lambda event: hub.submit(PauseOnLoop(bool(pause.value)), event.client))
@@ -69,7 +67,7 @@ class Panel(BasePanel):
         self.hub.scene.update(s)
         if event is not None and event.frame < len(s.trajectory) and client is not None:
             path = np.concatenate([s.trajectory[: event.frame + 1, :3, 3], event.trajectory_before])
-            self.hub.scene.show_box(client, path.min(0), path.max(0))
+            self.hub.views.show(client, path.mean(0) + AROUND * (path - path.mean(0)))
 
 
 def _name(event: LoopEvent) -> str:
@@ -90,9 +88,9 @@ def _figures(e: LoopEvent) -> str:
         ("Rotation error, °", theme.number(e.rotation_error_before_deg), theme.number(e.rotation_error_after_deg)),
     ]
     body = "".join(f"<tr><td>{name}</td><td>{before}</td><td><b>{after}</b></td></tr>" for name, before, after in rows)
-    old = ", ".join(str(k + 1) for k in e.keyframes)
+    old = f"keyframe{'s' * (len(e.keyframes) > 1)} {', '.join(str(k + 1) for k in e.keyframes)}"
     return (
-        f'<div class="ec"><b>Frame {e.frame + 1} met keyframes {old}</b><br>The pose moved by '
+        f'<div class="ec"><b>Frame {e.frame + 1} met {old}</b><br>The pose moved by '
         f"<b>{e.correction_cm:.2f} cm</b> and <b>{e.correction_deg:.2f}°</b>."
         f"<table><tr><th></th><th>before</th><th>after</th></tr>{body}</table></div>"
     )

@@ -15,25 +15,30 @@ from ..hub import Hub
 from ..panel import BasePanel
 
 EVERY_S = 0.5
-_ERROR = "Error so far (ATE, cm)"
+HEIGHT = 150
+_RESIDUAL = "_mm"  # ends the names of what is measured in millimetres and therefore no loss
 _PALETTE = (theme.ESTIMATE, theme.TRUTH, theme.WINDOW, theme.LOOP, (234, 179, 8), theme.BEFORE, theme.KEYFRAME)
 
 
 class Chart:
     """One uPlot chart whose series can grow in number."""
 
-    def __init__(self, hub: Hub, title: str, height: int = 170, legend: bool = True, markers: bool = False) -> None:
-        """``markers`` draws the last series as points only."""
-        self._gui, self._names, self._markers = hub.server.gui, [""], markers
+    def __init__(self, hub: Hub, title: str, legend: bool = True, markers: bool = False, peaks: bool = True) -> None:
+        """markers: the last series is points only. peaks: rare high values stay within the range.
+
+        A chart is out of sight until it has something to show.
+        """
+        self._gui, self._names, self._markers, self._peaks = hub.server.gui, [""], markers, peaks
         self._plot = self._gui.add_uplot(
             (np.array([0.0, 1.0]), np.array([np.nan, np.nan])),
             (uplot.Series(label="frame"), uplot.Series(label=title)),
             title=title,
-            height=height,
+            height=HEIGHT,
             axes=_axes(),
             legend=uplot.Legend(show=legend),
             cursor=uplot.Cursor(drag=uplot.Cursor_Drag(x=False, y=False)),
             padding=(6, 14, 0, 0),
+            visible=False,
         )
 
     def show(self, names: list[str], columns: tuple[NDArray[np.float64], ...]) -> None:
@@ -48,7 +53,8 @@ class Chart:
             if self._markers and len(names) > 1:
                 lines[-1] = _dots(names[-1])
             self._plot.series = (uplot.Series(label="frame"), *lines)
-        high = max(float(np.nanmax(c)) for c in columns[1:])
+        high = max(float(np.nanmax(c) if self._peaks else np.nanpercentile(c, 97)) for c in columns[1:])
+        self._plot.visible = True
         self._plot.scales = {
             "x": uplot.Scale(time=False, range=(float(columns[0][0]), float(columns[0][-1]))),
             "y": uplot.Scale(range=(0.0, high * 1.08 + 1e-6)),
@@ -57,15 +63,16 @@ class Chart:
 
 
 class Panel(BasePanel):
-    """Three charts, refreshed twice a second at most."""
+    """The charts, refreshed twice a second at most."""
 
     tab, order = "Plots", 10
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
-        self._error, self._losses, self._times = (
-            Chart(hub, title, legend=title != _ERROR) for title in (_ERROR, "Weighted losses", "Time per frame (ms)")
-        )
+        self._error = Chart(hub, "Error so far (ATE, cm)", legend=False)
+        self._losses = Chart(hub, "Weighted losses")
+        self._residual = Chart(hub, "Distance to the surface (mm)", legend=False)
+        self._times = Chart(hub, "Time per frame (ms)", peaks=False)
         self._shown = 0.0
 
     def snapshot(self, s: Snapshot) -> None:
@@ -74,10 +81,13 @@ class Panel(BasePanel):
         if moving and now - self._shown < EVERY_S:
             return
         self._shown = now
-        history, losses = self.hub.history, self.hub.history.names()
+        history, names = self.hub.history, self.hub.history.names()
+        losses = [name for name in names if not name.endswith(_RESIDUAL)]
+        residual = [name for name in names if name.endswith(_RESIDUAL)]
         with self.hub.server.atomic():
             self._error.show(["ATE"], history.series(["ate_cm"]))
             self._losses.show([n.removeprefix("loss ").replace("_", " ") for n in losses], history.series(losses))
+            self._residual.show(residual, history.series(residual))
             self._times.show(["tracking", "mapping"], history.series(["track_ms", "map_ms"]))
 
 

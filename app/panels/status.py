@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from html import escape
 
 from ecslam.messages import Ack, Pause, Resume, Snapshot, State, Step, Stop
@@ -21,6 +22,15 @@ WORDS = {
     State.FINISHED: "Finished",
     State.FAILED: "Failed",
 }
+_LEGEND = theme.legend(
+    [
+        ("estimate", theme.ESTIMATE),
+        ("ground truth", theme.TRUTH),
+        ("keyframes", theme.KEYFRAME),
+        ("BA window", theme.WINDOW),
+        ("loop closure", theme.LOOP),
+    ]
+)
 _COMING = {Pause: "Pausing …", Stop: "Stopping …", Step: "One step …", Resume: "Resuming …"}
 
 
@@ -32,11 +42,14 @@ class Panel(BasePanel):
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
         self._coming = ""
+        self._last: Snapshot | None = None
         self._html = hub.server.gui.add_html(render(None, ""))
 
     def snapshot(self, s: Snapshot) -> None:
         self._coming = ""
-        self._html.content = render(s, "")
+        # Most frames are not mapped: they show the last mapping's time and window instead of flickering to none.
+        self._last = _with_last_mapping(s, self._last)
+        self._html.content = render(self._last, "")
 
     def ack(self, ack: Ack) -> None:
         self._coming = _COMING.get(type(ack.command), "")
@@ -46,7 +59,13 @@ class Panel(BasePanel):
             State.FAILED,
         )
         if self._coming and not ack.error and not (settled and isinstance(ack.command, (Pause, Stop))):
-            self._html.content = render(self.hub.current, self._coming)
+            self._html.content = render(self._last, self._coming)
+
+
+def _with_last_mapping(s: Snapshot, last: Snapshot | None) -> Snapshot:
+    if s.window or last is None or last.frame > s.frame:
+        return s
+    return replace(s, window=last.window, map_ms=last.map_ms)
 
 
 def render(s: Snapshot | None, coming: str) -> str:
@@ -57,11 +76,11 @@ def render(s: Snapshot | None, coming: str) -> str:
     color = theme.STATE_COLORS[s.state.value]
     done = 100 * (s.frame + 1) / max(s.frames_total, 1)
     cells = [
-        theme.cell(theme.number(s.fps_wall, 1), "/s", "frames, wall clock"),
-        theme.cell(theme.number(s.fps_engine, 1), "/s", "frames, engine"),
+        theme.cell(theme.number(s.fps_wall or None, 1), "/s", "frames, wall clock"),
+        theme.cell(theme.number(s.fps_engine or None, 1), "/s", "frames, engine"),
         theme.cell(theme.number(s.ate_cm), "cm" if s.ate_cm is not None else "", "ATE so far"),
-        theme.cell(theme.number(s.track_ms, 0), "ms", "tracking"),
-        theme.cell(theme.number(s.map_ms, 0), "ms", "mapping"),
+        theme.cell(theme.number(s.track_ms or None, 0), "ms", "tracking"),
+        theme.cell(theme.number(s.map_ms or None, 0), "ms", "mapping"),
         theme.cell(theme.number(s.memory_mb, 0), "MB", "memory"),
         theme.cell(str(len(s.keyframes)), "", "keyframes"),
         theme.cell(str(len(s.window)), "", "in BA window"),
@@ -75,5 +94,5 @@ def render(s: Snapshot | None, coming: str) -> str:
         f'<span class="ec-name dim">{escape(s.sequence)} · {escape(s.preset)}</span></div>'
         f'<div class="ec-row"><span>Frame <b>{s.frame + 1}</b> of {s.frames_total}</span>'
         f'<span class="dim">{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
-        f'<div class="ec-grid">{"".join(cells)}</div>{"".join(notes)}</div>'
+        f'<div class="ec-grid">{"".join(cells)}</div>{_LEGEND}{"".join(notes)}</div>'
     )

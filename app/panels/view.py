@@ -9,7 +9,6 @@ import viser
 
 from ecslam.messages import RequestMesh
 
-from .. import theme
 from ..glb import TRIANGLE_BUDGET
 from ..hub import Hub
 from ..panel import BasePanel
@@ -43,21 +42,10 @@ class Panel(BasePanel):
         hub.on(follow, lambda event: self._set_follow(bool(follow.value)))
         hub.on(
             gui.add_button("Reset view", icon=viser.Icon.FOCUS_CENTERED, color="gray"),
-            lambda event: hub.scene.show_all(event.client),
+            lambda event: hub.views.show_all(event.client),
         )
         dark = gui.add_checkbox("Dark", hub.dark)
         hub.on(dark, lambda event: self._set_dark(bool(dark.value)))
-        gui.add_html(
-            theme.legend(
-                [
-                    ("estimate", theme.ESTIMATE),
-                    ("ground truth", theme.TRUTH),
-                    ("keyframes", theme.KEYFRAME),
-                    ("BA window", theme.WINDOW),
-                    ("loop closure", theme.LOOP),
-                ]
-            )
-        )
 
     def _set_layer(self, group: str, event: Any) -> None:
         self.hub.scene.set_visible(group, bool(event.target.value))
@@ -69,7 +57,7 @@ class Panel(BasePanel):
         self.hub.follow = on
         if on and self.hub.current is not None and len(self.hub.current.trajectory):
             for client in self.hub.viewers():
-                self.hub.scene.follow(client, self.hub.current.trajectory[-1])
+                self.hub.views.follow(client, self.hub.current.trajectory[-1])
 
     def _set_dark(self, on: bool) -> None:
         self.hub.dark = on

@@ -1,0 +1,109 @@
+"""Where each viewer looks from. The page frames what there is to see by itself, until a viewer takes the camera."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from .geometry import behind, overview
+from .scene import Scene
+
+Array = NDArray[np.float64]
+
+FOV_RAD = np.radians(50.0)
+GLIDE_S, GLIDE_STEPS_PER_S = 0.6, 30
+SETTLE_S = 1.0
+MOVED, WORTH_A_MOVE = 0.02, 0.12
+
+
+@dataclass(frozen=True)
+class _Framing:
+    """What the page has done for a viewer. until: when its glide and the browser's echo of it are over."""
+
+    position: Array
+    look_at: Array
+    until: float
+
+
+class Views:
+    """Moves viewers' cameras. Only the hub's thread calls these methods."""
+
+    def __init__(self, server: viser.ViserServer, scene: Scene) -> None:
+        self._server, self._scene = server, scene
+        self._framed: dict[int, _Framing] = {}
+
+    def welcome(self, client: viser.ClientHandle) -> None:
+        """Give a new viewer a first view."""
+        if client.client_id in self._server.get_clients():
+            client.camera.fov = FOV_RAD
+            self.show_all(client, 0.0)
+
+    def show_all(self, client: viser.ClientHandle, seconds: float = GLIDE_S) -> None:
+        """Bring everything into one viewer's sight, and keep it there as the map grows."""
+        place = self._overview(client, self._scene.points)
+        self._framed[client.client_id] = _Framing(*place, time.monotonic() + seconds + SETTLE_S)
+        self._fly(client, *place, seconds)
+
+    def keep_framed(self) -> None:
+        """The map has grown: move along the viewers that have left their camera to the page."""
+        clients = self._server.get_clients()
+        self._framed = {k: framing for k, framing in self._framed.items() if k in clients}
+        for number, framing in list(self._framed.items()):
+            if time.monotonic() < framing.until:
+                continue
+            client = clients[number]
+            distance = float(np.linalg.norm(framing.position - framing.look_at))
+            if np.linalg.norm(client.camera.position - framing.position) > MOVED * distance:
+                del self._framed[number]
+                continue
+            position, look_at = self._overview(client, self._scene.points)
+            away = max(np.linalg.norm(position - framing.position), np.linalg.norm(look_at - framing.look_at))
+            if away > WORTH_A_MOVE * distance:
+                self.show_all(client, 2 * GLIDE_S)
+
+    def show(self, client: viser.ClientHandle, points: Array) -> None:
+        """Bring points [n, 3] into one viewer's sight."""
+        self._leave(client)
+        self._fly(client, *self._overview(client, points), GLIDE_S)
+
+    def visit(self, client: viser.ClientHandle, c2w: Array) -> None:
+        """Fly one viewer to just behind a keyframe."""
+        self._leave(client)
+        self._fly(client, *behind(c2w, self._scene.up, 0.45), GLIDE_S)
+
+    def follow(self, client: viser.ClientHandle, c2w: Array) -> None:
+        """Put one viewer just behind the camera."""
+        self._leave(client)
+        _place(client, *behind(c2w, self._scene.up))
+
+    def _leave(self, client: viser.ClientHandle) -> None:
+        self._framed.pop(client.client_id, None)
+
+    def _overview(self, client: viser.ClientHandle, points: Array) -> tuple[Array, Array]:
+        return overview(points, self._scene.up, self._scene.side, client.camera.aspect or 1.5, FOV_RAD)
+
+    def _fly(self, client: viser.ClientHandle, position: Array, look_at: Array, seconds: float) -> None:
+        start = np.array(client.camera.position), np.array(client.camera.look_at)
+
+        async def glide() -> None:
+            steps = max(1, int(GLIDE_STEPS_PER_S * seconds))
+            for step in range(1, steps + 1):
+                if client.client_id not in self._server.get_clients():
+                    return
+                t = step / steps
+                ease = t * t * (3 - 2 * t)
+                _place(client, start[0] + ease * (position - start[0]), start[1] + ease * (look_at - start[1]))
+                await asyncio.sleep(1 / GLIDE_STEPS_PER_S)
+
+        asyncio.run_coroutine_threadsafe(glide(), self._server.get_event_loop())
+
+
+def _place(client: viser.ClientHandle, position: Array, look_at: Array) -> None:
+    with client.atomic():
+        client.camera.position = position
+        client.camera.look_at = look_at
