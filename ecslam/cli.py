@@ -70,10 +70,7 @@ def run(
     resolved = resolve_config(preset or opened.preset, opened.layout, config, settings, seed, schedule)
     folder = out or Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}"
     engine = commands.make_engine(resolved, sequence, opened, folder, commands.pick_device(device), frames)
-    if headless:
-        commands.run_headless(engine)
-    else:
-        commands.run_with_dashboard(engine, host, port, not no_browser)
+    commands.start(engine, headless, host, port, not no_browser)
 
 
 @app.command()
@@ -114,10 +111,7 @@ def resume(
     from . import commands
 
     engine = commands.resume_engine(folder, commands.pick_device(device))
-    if headless:
-        commands.run_headless(engine)
-    else:
-        commands.run_with_dashboard(engine, host, port, not no_browser)
+    commands.start(engine, headless, host, port, not no_browser)
 
 
 @app.command()

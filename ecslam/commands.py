@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
+import sys
+import threading
 import webbrowser
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from . import datasets
 from .config import Config
-from .evaluation.report import evaluate_run
 from .evaluation.trajectory import absolute_error, relative_error
 from .evaluation.trajectory_io import read_tum
 from .messages import Snapshot
 from .runtime.checkpoint import load_checkpoint
+from .runtime.driven import import_slam
 from .runtime.engine import Engine
 from .runtime.files import to_json, write_atomic
 from .runtime.mesh_files import mesh_bytes
@@ -36,6 +38,10 @@ def open_sequence(address: str) -> Sequence:
 
 def pick_device(name: str) -> str:
     """``auto`` becomes cuda or cpu. Raises InputError for a device that is not there."""
+    if name == "cpu" or (name == "auto" and not _may_have_cuda()):
+        return "cpu"
+    import torch
+
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -45,6 +51,11 @@ def pick_device(name: str) -> str:
     if kind == "cuda" and not torch.cuda.is_available():
         raise InputError(f"--device {name}: torch sees no CUDA GPU here; use --device cpu")
     return name
+
+
+def _may_have_cuda() -> bool:
+    """False where no NVIDIA device can be, which saves the second that asking torch takes."""
+    return sys.platform != "linux" or any(Path(name).exists() for name in ("/dev/nvidiactl", "/dev/dxg", "/dev/nvmap"))
 
 
 def make_engine(config: Config, address: str, opened: Sequence, out: Path, device: str, frames: str) -> Engine:
@@ -63,21 +74,41 @@ def resume_engine(folder: Path, device: str) -> Engine:
     return Engine.resume(folder, device=device, sequences=BUILT_IN)
 
 
+def start(engine: Engine, headless: bool, host: str, port: int, browser: bool) -> None:
+    """Run to the end, with or without the dashboard. The engine proper is imported while the first frames are read."""
+    importing = threading.Thread(target=import_slam, name="import", daemon=True)
+    importing.start()
+    try:
+        if headless:
+            run_headless(engine)
+        else:
+            run_with_dashboard(engine, host, port, browser)
+    finally:
+        importing.join()
+
+
 def run_headless(engine: Engine) -> None:
     """Run to the end with a progress line, then say what came out and where it lies."""
     with _progress() as bar, quit_on_signals(engine):
         task = bar.add_task("starting", total=None)
 
         def show(s: Snapshot) -> None:
-            ate = "" if s.ate_cm is None else f"  ATE {s.ate_cm:.2f} cm"
-            text = (
-                f"frame {s.frame + 1}/{s.frames_total}  {s.fps_wall:.1f} frames/s  loss {sum(s.losses.values()):.3f}"
-                f"{ate}  window {len(s.window)}"
-            )
-            bar.update(task, description=f"{s.state.value}: {text}", completed=s.frame + 1, total=s.frames_total)
+            bar.update(task, description=progress_line(s), completed=s.frame + 1, total=s.frames_total)
 
         summary = engine.run(show)
     finish_run(engine, summary)
+
+
+def progress_line(s: Snapshot) -> str:
+    """The state of a run in a line. loss: objective of the last mapping; residual: of the frame's direct alignment."""
+    figures = [f"{s.state.value}: frame {s.frame + 1}/{s.frames_total}", f"{s.fps_wall:.1f} frames/s"]
+    if s.map_loss is not None:
+        figures.append(f"loss {s.map_loss:.3f}")
+    if "align_mm" in s.losses:
+        figures.append(f"residual {s.losses['align_mm']:.1f} mm")
+    if s.ate_cm is not None:
+        figures.append(f"ATE {s.ate_cm:.2f} cm")
+    return "  ".join(figures)
 
 
 def run_with_dashboard(engine: Engine, host: str, port: int, browser: bool) -> None:
@@ -98,8 +129,6 @@ def run_with_dashboard(engine: Engine, host: str, port: int, browser: bool) -> N
 
 def view(folders: list[Path], host: str, port: int, browser: bool) -> None:
     """Serve finished runs until Ctrl-C."""
-    import threading
-
     from ecslam_app import server
 
     dashboard = server.view(folders, host, port)
@@ -137,20 +166,13 @@ def draw_picture(folder: Path) -> Path | None:
     times, poses = read_tum(folder / "trajectory.txt")
     truth = read_truth(folder, times)
     summary = json.loads((folder / "summary.json").read_text())
-    plot_run(folder / "picture.png", mesh, poses, truth, title=_title(summary))
+    title = f"{summary['sequence']}, {summary['preset']}: {summary['fps_wall']:.1f} frames/s"
+    plot_run(folder / "picture.png", mesh, poses, truth, title)
     return folder / "picture.png"
-
-
-def _title(summary: dict[str, Any]) -> str:
-    ate = summary["ate_rmse_cm"]
-    accuracy = "" if ate is None else f", ATE RMSE {ate:.2f} cm"
-    return f"{summary['sequence']}, {summary['preset']}: {summary['fps_wall']:.1f} frames/s{accuracy}"
 
 
 def read_truth(folder: Path, times: Any) -> Any:
     """Ground-truth poses [N, 4, 4] at ``times``, NaN where there is none; None without ground truth."""
-    import numpy as np
-
     path = folder / "groundtruth.txt"
     if not path.is_file():
         return None
@@ -172,6 +194,8 @@ def read_mesh(path: Path) -> Mesh:
 
 def evaluate(folder: Path) -> None:
     """Fill ``summary.json`` with the figures that need ground truth, and print them."""
+    from .evaluation.report import evaluate_run
+
     summary_path, about_path = folder / "summary.json", folder / "run.json"
     if not summary_path.is_file() or not about_path.is_file():
         raise InputError(f"{folder}: no finished run here; give the folder that `ecslam run --out` wrote")

@@ -106,7 +106,8 @@ class Snapshot:
 
     trajectory: float64 [n, 4, 4] estimate of frames 0..n-1, in the world of the ground truth where there is one.
     trajectory_gt: float64 [N, 4, 4] (NaN where missing) or None. color: uint8 [h, w, 3] of the current frame, small.
-    fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, else "".
+    fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, else "". map_loss: the
+    objective of the last mapping so far; losses: see ``StepReport``.
     """
 
     state: State
@@ -132,6 +133,7 @@ class Snapshot:
     skipped: int
     lost_frames: int
     reason: str = ""
+    map_loss: float | None = None
 
 
 @dataclass(frozen=True)

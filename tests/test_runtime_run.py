@@ -12,6 +12,7 @@ import trimesh
 from fake_slam import QUICK, Behaviour, FakeSequence, circle, maker, open_fake
 from runtime_watch import running
 
+from ecslam.commands import progress_line
 from ecslam.config import load_config
 from ecslam.evaluation.trajectory import absolute_error
 from ecslam.messages import Notice, State
@@ -46,7 +47,7 @@ def test_the_run_folder_is_complete(tmp_path):
     assert load_config(out / "config.yaml") == config
     metrics = list(read_lines(out / "metrics.jsonl"))
     assert [m["frame"] for m in metrics] == list(range(30))
-    keys = "frame timestamp c2w tracked lost keyframe window losses track_ms map_ms ate_cm"
+    keys = "frame timestamp c2w tracked lost keyframe window window_c2w losses track_ms map_ms ate_cm"
     assert sorted(metrics[0]) == sorted(keys.split())
     assert np.array(metrics[4]["c2w"]).shape == (12,)
     trajectory = np.loadtxt(out / "trajectory.txt")
@@ -131,7 +132,7 @@ def test_repeated_and_backward_time_stamps_are_skipped(tmp_path):
 
 
 def test_snapshots_keep_a_row_for_each_frame_and_say_lost(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "SNAPSHOT_PERIOD_S", 0.0)
+    monkeypatch.setattr(module, "UNWATCHED_PERIOD_S", 0.0)
     seen = []
     engine(tmp_path, FakeSequence(12, bad=(4,)), Behaviour(lost=(6, 7))).run(seen.append)
     last, states = seen[-1], {m.frame: m.state for m in seen[:-1]}
@@ -153,6 +154,15 @@ def test_progress_sees_the_run(tmp_path):
     assert seen[0].state is State.INITIALISING
     assert seen[-1].state is State.FINISHED
     assert seen[-1].ate_cm is not None
+
+
+def test_the_progress_line_names_the_loss_of_mapping_and_the_residual_of_tracking_apart(tmp_path):
+    seen = []
+    engine(tmp_path, FakeSequence(8)).run(seen.append)
+    assert (seen[0].map_loss, seen[-1].map_loss) == (None, 0.5 + 0.25 * QUICK.mapping.iterations)
+    assert " loss " not in progress_line(seen[0])
+    tracked = replace(seen[-1], losses={"align_mm": 6.21}, map_loss=1.25, ate_cm=0.5)
+    assert progress_line(tracked).split("  ")[2:] == ["loss 1.250", "residual 6.2 mm", "ATE 0.50 cm"]
 
 
 def test_a_full_disk_does_not_end_the_run(tmp_path, monkeypatch):

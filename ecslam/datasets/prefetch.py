@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from ..types import Frame, FrameError, Sequence
 
+MOST_WORKERS = 12
+
 
 def prefetch(
-    sequence: Sequence, indices: Iterable[int] | None = None, *, workers: int = 2, ahead: int = 4
+    sequence: Sequence, indices: Iterable[int] | None = None, *, workers: int | None = None, ahead: int | None = None
 ) -> Iterator[tuple[int, Frame | FrameError]]:
     """Yield (index, frame) in the order of ``indices`` (default: all), with at most ``ahead`` frames read in advance.
 
+    workers: threads, by default one a core within reason; ahead: by default two a worker.
     Whatever goes wrong with one frame is yielded in its place as a FrameError and the rest goes on. Closing the
     generator, or dropping it, cancels what has not begun and waits only for the reads under way.
     """
+    workers = workers or min(max(os.cpu_count() or 1, 2), MOST_WORKERS)
+    ahead = 2 * workers if ahead is None else ahead
     pending: deque[tuple[int, Future[Frame | FrameError]]] = deque()
     with ThreadPoolExecutor(workers, thread_name_prefix="prefetch") as pool:
         try:

@@ -102,6 +102,11 @@ class SlamFactory(Protocol):
         ...
 
 
+def import_slam() -> None:
+    """Import what ``make_slam`` needs, which takes seconds; any thread may do so ahead of it."""
+    from .. import slam as slam
+
+
 def make_slam(
     config: Config,
     intrinsics: Intrinsics,

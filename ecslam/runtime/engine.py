@@ -30,7 +30,7 @@ from .snapshots import state_of, take_snapshot
 from .workshop import Workshop
 
 CHECKPOINT_EVERY = 5
-SNAPSHOT_PERIOD_S = 1 / 30
+WATCHED_PERIOD_S, UNWATCHED_PERIOD_S = 1 / 30, 1 / 4
 LONG_STEP_S = 0.5
 
 Items = Iterator[tuple[int, Frame | FrameError]]
@@ -261,7 +261,7 @@ class Engine:
         self._run.notice("error", _words(error))
 
     def _show(self, state: State, reason: str = "") -> None:
-        self._next_snapshot = monotonic() + SNAPSHOT_PERIOD_S
+        self._next_snapshot = monotonic() + (WATCHED_PERIOD_S if self._feed.watched else UNWATCHED_PERIOD_S)
         snapshot = take_snapshot(self._run, state, reason)
         self._feed.publish(snapshot)
         self._progress(snapshot)

@@ -65,6 +65,7 @@ class Run:
         self.torn = False
         self.report: StepReport | None = None
         self.ate_cm: Spread | None = None
+        self.map_loss: float | None = None
         self.loops: list[LoopEvent] = []
         self._emit, self._make = emit, make
         self._checkpoints = CheckpointWriter(
@@ -75,7 +76,7 @@ class Run:
             frame=self.tally.position,
         )
         self.thumbnails: dict[int, NDArray[np.uint8]] = {}
-        self.picture: NDArray[np.uint8] | None = None
+        self._color: NDArray[np.uint8] | None = None
         self.lost_for = 0
         if resumed:
             self._build(None, resumed.arrays)
@@ -119,7 +120,7 @@ class Run:
             way = "repeats" if item.timestamp == last else "goes back in"
             self._skip(index, f"frame {index} {way} time ({item.timestamp:.6f} s after {last:.6f} s)")
             return None
-        self.picture = shrink(item.color, PICTURE_WIDTH)
+        self._color = item.color
         try:
             report = self._step(item, interrupt)
         except FrameError as error:
@@ -181,6 +182,8 @@ class Run:
         self.tally.add(report)
         self.report = report
         self.lost_for = self.lost_for + 1 if report.lost else 0
+        if report.window and report.losses:
+            self.map_loss = sum(report.losses.values())
         if len(self.tally.rows) % ATE_EVERY == 0:
             self.measure()
         if report.is_keyframe:
@@ -211,6 +214,11 @@ class Run:
         self._emit(notice)
 
     # ---- what there is so far ---------------------------------------------------------------------------------------
+
+    @property
+    def picture(self) -> NDArray[np.uint8] | None:
+        """The current frame, small; None before the first."""
+        return None if self._color is None else shrink(self._color, PICTURE_WIDTH)
 
     def poses(self) -> NDArray[np.float64]:
         """Poses [n, 4, 4] of the processed frames; the frame of a torn step is left out."""

@@ -57,4 +57,5 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
         skipped=tally.skipped,
         lost_frames=tally.lost,
         reason=reason,
+        map_loss=run.map_loss,
     )
