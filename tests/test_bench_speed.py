@@ -34,6 +34,8 @@ def test_speed_of_a_tiny_run(tmp_path):
     assert 0 < m["fps_wall"] < m["fps_engine"]
     assert m["stored_keyframes_mb"] > 0
     assert m["cost_growth"] is None
+    assert m["memory_frame"][-1] == 11
+    assert 0 < min(m["memory_mb"]) <= max(m["memory_mb"]) <= 1.01 * m["peak_memory_mb"]
     text = io.StringIO()
     speed.print_table(result, Console(file=text, width=200))
     assert f"{m['fps_wall']:.2f}" in text.getvalue()
@@ -51,6 +53,7 @@ def test_growth_compares_the_end_with_frames_200_to_400():
     assert growth["cost_growth"] == pytest.approx(cost[frames >= 800].mean() / 10)
     assert growth["memory_growth_mb"] == pytest.approx(60, abs=0.2)
     assert growth["keyframe_growth_mb"] == pytest.approx(120)
+    assert growth["other_growth_mb"] == pytest.approx(-60, abs=0.2)
     assert set(speed._growth(cost[:598], memory, keyframes, 200.0).values()) == {None}
 
 

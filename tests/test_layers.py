@@ -116,6 +116,12 @@ def test_no_two_modules_import_each_other():
             assert module not in imports(name, at_start_only=True), f"{module} and {name}"
 
 
+def test_the_command_starts_without_heavy_libraries():
+    found = {name.split(".")[0] for name in reached("ecslam.commands")}
+    assert {"numpy", "cv2"} <= found
+    assert not found & {"torch", "scipy", "numba", "matplotlib", "trimesh", "skimage", "viser", "ecslam_app"}
+
+
 def test_datasets_import_the_ground_layer_only():
     for module in MODULES:
         if module.startswith("ecslam.datasets"):

@@ -8,8 +8,9 @@ import platform
 import resource
 import statistics
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,12 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from ..config import Config, for_layout, load_config, load_preset
 from ..datasets import open_sequence, select_frames
+from ..messages import Snapshot
 from ..runtime.checkpoint import load_checkpoint
 from ..runtime.engine import Engine
 from ..runtime.tally import peak_memory_mb
@@ -42,6 +45,7 @@ ROWS = {
     "stored_keyframes_mb": "stored keyframes (MB)",
     "memory_growth_mb": f"memory grown since {SPAN}-{2 * SPAN} (MB)",
     "keyframe_growth_mb": "keyframes stored since (MB)",
+    "other_growth_mb": "grown beyond them (MB)",
 }
 
 Figures = dict[str, Any]
@@ -91,16 +95,23 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
 
     frames_done; fps_wall (everything), fps_engine (tracking and mapping after the first frame), ate_rmse_cm;
     first_map_ms; track_ms and map_ms, means over the frames after the first; cost_ms, their sum for each frame, the
-    first left out; peak_memory_mb, stored_keyframes_mb. Growth from the mean over frames 200-400 to the mean over the
-    last 200, None under 600 frames: cost_growth (a ratio), memory_growth_mb (of resident memory), and
-    keyframe_growth_mb (what the keyframes stored in between weigh). Raises InputError.
+    first left out; peak_memory_mb, stored_keyframes_mb; memory_mb, resident memory at some of the frames, which are in
+    memory_frame. Growth from the mean over frames 200-400 to the mean over the last 200, None under 600 frames:
+    cost_growth (a ratio), memory_growth_mb (of resident memory), keyframe_growth_mb (what the keyframes stored in
+    between weigh) and other_growth_mb, the difference of the two. Raises InputError.
     """
     memory: dict[int, float] = {}
     opened = open_sequence(sequence)
     with tempfile.TemporaryDirectory(prefix="ecslam-bench-") as parent:
         folder = Path(parent) / "run"
         engine = Engine(_config(preset, opened), opened, folder, device=device, frames=frames)
-        summary = engine.run(lambda snapshot: memory.update({snapshot.frame: _resident_mb()}))
+        with _progress(preset) as show:
+
+            def watch(snapshot: Snapshot) -> None:
+                memory[snapshot.frame] = _resident_mb()
+                show(snapshot)
+
+            summary = engine.run(watch)
         lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
         arrays = load_checkpoint(folder / "checkpoints").arrays
     stored_mb = sum(a.nbytes for name, a in arrays.items() if name.startswith("keyframes.")) / 1e6
@@ -115,6 +126,8 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
         "stored_keyframes_mb": stored_mb,
         **_growth(track + mapped, memory, np.array([i for i, line in enumerate(lines) if line["keyframe"]]), stored_mb),
         "cost_ms": (track + mapped).tolist(),
+        "memory_frame": list(memory),
+        "memory_mb": list(memory.values()),
     }
 
 
@@ -139,19 +152,23 @@ def print_table(result: Figures, console: Console | None = None) -> None:
 
 
 def plot_speed(result: Figures, path: Path) -> None:
-    """Write a PNG: milliseconds per frame over the frames, smoothed, a line a preset; the rival's mean dashed."""
-    figure = Figure(figsize=(9, 4.5), dpi=120, layout="constrained")
-    axes = figure.add_subplot()
+    """Write a PNG, a line a preset over the frames: milliseconds per frame, smoothed, the rival's mean dashed; below
+    it resident memory."""
+    figure = Figure(figsize=(9, 7), dpi=120, layout="constrained")
+    axes, memory = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for name, m in result["presets"].items():
         width = min(SMOOTH, len(m["cost_ms"]))
         if width:
             smooth = np.convolve(m["cost_ms"], np.full(width, 1 / width), "valid")
             axes.plot(np.arange(len(smooth)) + 1 + width // 2, smooth, label=f"{name}: {m['fps_wall']:.1f} frames/s")
+        memory.plot(m["memory_frame"], m["memory_mb"])
     if result["peer"]:
         fps = result["peer"]["fps_wall"]
         axes.axhline(1e3 / fps, color="grey", linestyle="--", label=f"{PEER}: {fps:.1f} frames/s, all included")
-    axes.set(title=f"{result['sequence']} on {result['machine']}", xlabel="frame", ylabel="tracking + mapping (ms)")
-    axes.set_ylim(bottom=0)
+    axes.set(title=f"{result['sequence']} on {result['machine']}", ylabel="tracking + mapping (ms)")
+    memory.set(xlabel="frame", ylabel="memory (MB)")
+    for each in (axes, memory):
+        each.set_ylim(bottom=0)
     axes.legend(frameon=False)
     figure.savefig(path, format="png")
 
@@ -161,6 +178,15 @@ def _config(preset: str, sequence: Sequence) -> Config:
     if preset.endswith((".yaml", ".yml")):
         return load_config(Path(preset), for_layout(load_preset(sequence.preset), sequence.layout))
     return for_layout(load_preset(preset), sequence.layout)
+
+
+@contextmanager
+def _progress(preset: str) -> Iterator[Callable[[Snapshot], None]]:
+    """What to call with every snapshot of a run, for a bar on stderr."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, refresh_per_second=2) as bar:
+        task = bar.add_task(preset, total=None)
+        yield lambda s: bar.update(task, completed=s.frame + 1, total=s.frames_total)
 
 
 def _in_own_process(job: Callable[..., Figures], arguments: tuple[str, ...]) -> Figures:
@@ -192,14 +218,16 @@ def _growth(
     """See ``measure``. memory: resident megabytes by frame; keyframes: [k] their frames."""
     count = len(cost_ms) + 1
     if count < 3 * SPAN:
-        return {"cost_growth": None, "memory_growth_mb": None, "keyframe_growth_mb": None}
+        return dict.fromkeys(("cost_growth", "memory_growth_mb", "keyframe_growth_mb", "other_growth_mb"))
     early, late = range(SPAN, 2 * SPAN), range(count - SPAN, count)
     resident = [np.mean([mb for frame, mb in memory.items() if frame in span]) for span in (early, late)]
-    between = (keyframes >= 1.5 * SPAN) & (keyframes < count - SPAN / 2)
+    grown_mb = float(resident[1] - resident[0])
+    between_mb = float(stored_mb * ((keyframes >= 1.5 * SPAN) & (keyframes < count - SPAN / 2)).mean())
     return {
         "cost_growth": float(cost_ms[-SPAN:].mean() / cost_ms[SPAN - 1 : 2 * SPAN - 1].mean()),
-        "memory_growth_mb": float(resident[1] - resident[0]),
-        "keyframe_growth_mb": float(stored_mb * between.mean()),
+        "memory_growth_mb": grown_mb,
+        "keyframe_growth_mb": between_mb,
+        "other_growth_mb": grown_mb - between_mb,
     }
 
 

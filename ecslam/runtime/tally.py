@@ -94,6 +94,6 @@ class Stopwatch:
 
 
 def peak_memory_mb() -> float:
-    """The most memory this process has had so far."""
+    """The most memory this process has had so far, in 10^6 bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1024
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
