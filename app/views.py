@@ -36,6 +36,8 @@ class Views:
     def __init__(self, server: viser.ViserServer, scene: Scene) -> None:
         self._server, self._scene = server, scene
         self._framed: dict[int, _Framing] = {}
+        self._points = scene.points
+        self._places: dict[float, tuple[Array, Array]] = {}
 
     def welcome(self, client: viser.ClientHandle) -> None:
         """Give a new viewer a first view."""
@@ -45,7 +47,7 @@ class Views:
 
     def show_all(self, client: viser.ClientHandle, seconds: float = GLIDE_S) -> None:
         """Bring everything into one viewer's sight, and keep it there as the map grows."""
-        place = self._overview(client, self._scene.points)
+        place = self._all(client)
         self._framed[client.client_id] = _Framing(*place, time.monotonic() + seconds + SETTLE_S)
         self._fly(client, *place, seconds)
 
@@ -61,7 +63,7 @@ class Views:
             if np.linalg.norm(client.camera.position - framing.position) > MOVED * distance:
                 del self._framed[number]
                 continue
-            position, look_at = self._overview(client, self._scene.points)
+            position, look_at = self._all(client)
             away = max(np.linalg.norm(position - framing.position), np.linalg.norm(look_at - framing.look_at))
             if away > WORTH_A_MOVE * distance:
                 self.show_all(client, 2 * GLIDE_S)
@@ -69,7 +71,7 @@ class Views:
     def show(self, client: viser.ClientHandle, points: Array) -> None:
         """Bring points [n, 3] into one viewer's sight."""
         self._leave(client)
-        self._fly(client, *self._overview(client, points), GLIDE_S)
+        self._fly(client, *self._overview(points, client.camera.aspect), GLIDE_S)
 
     def visit(self, client: viser.ClientHandle, c2w: Array) -> None:
         """Fly one viewer to just behind a keyframe."""
@@ -84,8 +86,17 @@ class Views:
     def _leave(self, client: viser.ClientHandle) -> None:
         self._framed.pop(client.client_id, None)
 
-    def _overview(self, client: viser.ClientHandle, points: Array) -> tuple[Array, Array]:
-        return overview(points, self._scene.up, self._scene.side, client.camera.aspect or 1.5, FOV_RAD)
+    def _all(self, client: viser.ClientHandle) -> tuple[Array, Array]:
+        """The overview of everything; worked out once for all viewers whose windows have the same shape."""
+        if self._points is not self._scene.points:
+            self._points, self._places = self._scene.points, {}
+        aspect = client.camera.aspect
+        if aspect not in self._places:
+            self._places[aspect] = self._overview(self._points, aspect)
+        return self._places[aspect]
+
+    def _overview(self, points: Array, aspect: float) -> tuple[Array, Array]:
+        return overview(points, self._scene.up, self._scene.side, aspect or 1.5, FOV_RAD)
 
     def _fly(self, client: viser.ClientHandle, position: Array, look_at: Array, seconds: float) -> None:
         start = np.array(client.camera.position), np.array(client.camera.look_at)

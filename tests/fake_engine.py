@@ -7,6 +7,7 @@ import queue
 import threading
 import time
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from ecslam.runtime.feed import Feed
 from ecslam.types import InputError, Mesh
 
 FOV, ASPECT = 0.9, 4 / 3
-MESH_EVERY = 15
+MESH_EVERY_S = 1.0
 
 
 def room_mesh(step: float = 0.08) -> Mesh:
@@ -86,6 +87,7 @@ def walk(count: int) -> np.ndarray:
     return poses
 
 
+@lru_cache(2000)
 def picture(frame: int, tint: float = 0.0) -> np.ndarray:
     y, x = np.mgrid[0:120, 0:160] / 160.0
     red = 150 + 70 * np.sin(6 * x + frame / 15)
@@ -135,6 +137,7 @@ class FakeEngine:
 
     def _reset(self):
         self._frame, self._state, self._until, self._loops = -1, m.State.INITIALISING, None, ()
+        self._meshed = -1e9
 
     def _run(self):
         while self._alive:
@@ -150,7 +153,7 @@ class FakeEngine:
     def _advance(self):
         self._frame += 1
         i = self._frame
-        if i % MESH_EVERY == 0:
+        if time.monotonic() - self._meshed > MESH_EVERY_S:
             self._show_mesh(0.04)
         self._state = m.State.MAPPING if i % 5 == 0 else m.State.TRACKING
         if i == int(0.9 * self.frames):
@@ -245,6 +248,7 @@ class FakeEngine:
                 pass
 
     def _show_mesh(self, voxel):
+        self._meshed = time.monotonic()
         share = min(1.0, 0.25 + 0.75 * max(self._frame, 0) / self.frames)
         faces = self._mesh.faces[: int(len(self._mesh.faces) * share)]
         self._feed.publish(m.MeshReady(max(self._frame, 0), voxel, replace(self._mesh, faces=faces)))

@@ -90,7 +90,9 @@ def odd_snapshots(engine):
 
 
 def test_panels_and_scene_show_every_kind_of_snapshot(page, engine, caplog):
-    for s in odd_snapshots(engine):
+    odd = list(odd_snapshots(engine))
+    assert until(lambda: page.hub.current is engine.latest())
+    for s in odd:
         done = threading.Event()
         page.hub._take(s)
         page.hub.post(done.set)
