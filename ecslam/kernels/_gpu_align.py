@@ -57,8 +57,7 @@ def gradients_kernel(field, points, sdf, d_sdf, luminance, d_luminance, shape: t
 @triton.jit
 def robust(residual, kernel):
     """Geman-McClure of residuals, float64: share k^2 / (k^2 + r^2); the weight is its square."""
-    k = kernel.to(tl.float64)
-    return k * k / (k * k + residual * residual)
+    return kernel * kernel / (kernel * kernel + residual * residual)
 
 
 @triton.jit

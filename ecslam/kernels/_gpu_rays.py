@@ -136,8 +136,12 @@ def losses_kernel(
         pull += up * shade
         tl.store(rgb + 3 * at + k, up * weight * shade * (1 - shade), there)
 
+    # What all samples are pulled by alike only scales what the ray lets through: apart, nothing large cancels.
+    common = tl.sum(weight * pull, 1) / tl.maximum(tl.sum(weight, 1), 1e-12)
+    pull -= common[:, None]
     behind = pull * weight
     d_sigma = pull * before * tl.exp(-sigma) - (tl.cumsum(behind, 1, reverse=True) - behind)
+    d_sigma += (common * tl.exp(-tl.sum(sigma, 1)))[:, None]
     d_sdf = d_free + d_centre + d_tail - d_sigma * beta * beta * sharp * rest
     tl.store(sdf + at, d_sdf, there)
     if want_beta:

@@ -11,6 +11,7 @@ With TRITON_INTERPRET=1 the same code runs in Triton's interpreter on the CPU, f
 from __future__ import annotations
 
 import os
+import weakref
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -29,30 +30,26 @@ from ._gpu_rays import Targets, losses_kernel, render_kernel
 
 BLOCK = 64  # points; one matrix product's rows
 RAY_ELEMENTS = 512  # padded samples that one program renders
-KEPT_LAYOUTS = 8
 PROGRAMS_A_PROCESSOR = 2
 
-_layouts: dict[tuple[int, torch.device], tuple[GridLayout, tuple[Tensor, Tensor, Tensor]]] = {}
+_layouts: dict[tuple[int, torch.device], tuple[Tensor, Tensor, Tensor]] = {}
 
 
 def _on_device(layout: GridLayout, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """The layout as ``Field`` has it. Kept for the last few layouts: uploading waits, and no graph could record it."""
+    """The layout as ``Field`` has it. Kept while the layout lives: uploading waits, and no graph can record it."""
     key = (id(layout), device)
-    held = _layouts.get(key)
-    if held is not None and held[0] is layout:
-        return held[1]
+    if key in _layouts:
+        return _layouts[key]
     columns = [layout.offset[:, None], layout.size[:, None] - 1, layout.first, layout.dims]
     geometry = [layout.anchor, layout.blob_low, 1 / layout.blob_size.double(), layout.box[0], layout.box[1]]
     inverse = 1 / layout.voxel.double()
-    made = (
+    _layouts[key] = (
         torch.cat(columns, 1).to(torch.int32).to(device),
         torch.stack([inverse.float(), (inverse - inverse.float()).float()], 1).to(device),
         torch.cat([part.double() for part in geometry]).to(device),
     )
-    for old in list(_layouts)[: max(0, len(_layouts) + 1 - KEPT_LAYOUTS)]:
-        _layouts.pop(old, None)
-    _layouts[key] = (layout, made)
-    return made
+    weakref.finalize(layout, _layouts.pop, key, None)
+    return _layouts[key]
 
 
 def _flat(tensor: Tensor) -> Tensor:

@@ -1,0 +1,185 @@
+"""The GPU kernels in Triton's interpreter against the float64 reference: every function, every gradient, ragged sizes.
+
+Not collected by itself: ``test_kernels_gpu.py`` runs it in a process of its own, since TRITON_INTERPRET=1 must be set
+before Triton is imported and then holds for the whole process. A block takes about a third of a second, so sizes are
+small.
+"""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from kernel_cases import (
+    ALIGN,
+    BOX,
+    WEIGHTS,
+    blank,
+    double,
+    make_field,
+    make_points,
+    make_poses,
+    make_rays,
+    relative_rms,
+)
+
+from ecslam.config import FieldConfig
+from ecslam.field import grow_field
+from ecslam.kernels import FieldParams, gpu, reference
+
+torch.set_num_threads(1)
+SIZES = (0, 1, 63, 64, 65, 300)
+CLOSE = 1e-4
+FIELDS = {
+    "mixed": FieldConfig(log2_table_size=12, init_scale=0.1),
+    "odd": FieldConfig(levels=5, log2_table_size=10, blob_bins=7, init_scale=0.1),
+    "wide": FieldConfig(levels=17, log2_table_size=14, blob_bins=4, init_scale=0.1),
+}
+
+
+def assert_close(found, expected):
+    """Each tensor of one tuple to that of the other."""
+    for mine, theirs in zip(found, expected, strict=True):
+        assert mine.dtype == torch.float32
+        assert relative_rms(mine, theirs) < CLOSE
+
+
+def assert_step(field, c2w, rays, want_params=True, want_poses=True, weights=WEIGHTS):
+    mine, theirs = blank(field.params), blank(double(field.params))
+    found = gpu.step(field.layout, field.params, c2w, rays, weights, mine if want_params else None, want_poses)
+    exact = double(field.params), c2w.double(), double(rays), weights, theirs if want_params else None, want_poses
+    expected = reference.step(field.layout, *exact)
+    assert_close([found.losses], [expected.losses])
+    assert (found.d_c2w is None) == (not want_poses)
+    if want_poses:
+        assert_close([found.d_c2w], [expected.d_c2w])
+    for name in (f.name for f in fields(FieldParams)):
+        if want_params:
+            assert relative_rms(getattr(mine, name), getattr(theirs, name)) < CLOSE, name
+        else:
+            assert (getattr(mine, name) == 1e3).all()
+
+
+def assert_render(field, c2w, rays):
+    expected = reference.render(field.layout, double(field.params), c2w.double(), double(rays))
+    assert_close(gpu.render(field.layout, field.params, c2w, rays), expected)
+
+
+def assert_fields(field, points):
+    params = double(field.params)
+    for function in ("values", "gradients"):
+        expected = getattr(reference, function)(field.layout, params, points.double())
+        assert_close(getattr(gpu, function)(field.layout, field.params, points), expected)
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_values_and_gradients(count):
+    assert_fields(make_field(), make_points(count))
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_step_and_render(count):
+    c2w, rays = make_rays(count, 2)
+    assert_step(make_field(), c2w, rays)
+    assert_render(make_field(), c2w, rays)
+
+
+@pytest.mark.parametrize(("count", "samples"), [(3, 43), (70, 1)])
+def test_step_and_render_with_other_numbers_of_samples(count, samples):
+    c2w, rays = make_rays(count, samples)
+    assert_step(make_field(), c2w, rays)
+    assert_render(make_field(), c2w, rays)
+
+
+def test_step_with_more_samples_than_a_block_of_rays_holds():
+    assert_step(make_field(), *make_rays(1, gpu.RAY_ELEMENTS + 1), want_params=False)
+
+
+@pytest.mark.parametrize("kind", ["odd", "wide"])
+def test_other_shapes_of_field(kind):
+    assert_fields(make_field(FIELDS[kind]), make_points(40))
+    assert_step(make_field(FIELDS[kind]), *make_rays(12, 7, poses=5))
+
+
+def test_after_the_box_grew():
+    field = grow_field(make_field(), BOX * 1.5)
+    assert_fields(field, make_points(40))
+    assert_step(field, *make_rays(12, 7))
+
+
+@pytest.mark.parametrize(("want_params", "want_poses"), [(False, True), (True, False), (False, False)])
+def test_step_gives_what_is_asked_for(want_params, want_poses):
+    c2w, rays = make_rays(12, 7)
+    assert_step(make_field(), c2w[:, :3].contiguous(), rays, want_params, want_poses)
+
+
+@pytest.mark.parametrize("feature", [True, False])
+@pytest.mark.parametrize("depth", [True, False])
+def test_step_when_all_rays_are_alike(feature, depth):
+    c2w, rays = make_rays(12, 5)
+    rays = replace(rays, feature=torch.full_like(rays.feature, feature), depth=torch.full((12,), 0.7) * depth)
+    assert_step(make_field(), c2w, rays)
+
+
+@pytest.mark.parametrize("beta", [0.5, 300.0])
+def test_step_with_soft_and_hard_surfaces(beta):
+    field = make_field()
+    assert_step(replace(field, params=replace(field.params, beta=torch.tensor([beta]))), *make_rays(12, 10))
+
+
+def test_a_block_may_meet_many_poses_and_skip_some():
+    c2w, rays = make_rays(40, 3, poses=9)
+    rays = replace(rays, pose=torch.where(rays.pose == 4, 5, rays.pose))
+    assert_step(make_field(), c2w, rays)
+    assert not gpu.step(make_field().layout, make_field().params, c2w, rays, WEIGHTS, None, True).d_c2w[4].any()
+
+
+def test_programs_that_take_several_blocks(monkeypatch):
+    monkeypatch.setattr(gpu, "PROGRAMS_A_PROCESSOR", 1)
+    monkeypatch.setattr(gpu, "_processors", lambda device: 1)
+    assert_step(make_field(), *make_rays(40, 4))
+
+
+@pytest.mark.parametrize(("count", "colour"), [(0, 0.1), (1, 0.1), (63, 0.0), (64, 0.1), (65, 0.1), (300, 0.1)])
+def test_normal_equations(count, colour):
+    field, points = make_field(), make_points(count, seed=1)
+    luminance = torch.rand(count, generator=torch.Generator().manual_seed(2))
+    c2w = make_poses(1, torch.Generator().manual_seed(3))[0]
+    settings = replace(ALIGN, colour_weight=colour, gradient_low=0.05, tsdf_limit=0.3)
+    found = gpu.normal_equations(field.layout, field.params, c2w, points, luminance, settings)
+    exact = double(field.params), c2w.double(), points.double(), luminance.double(), settings
+    expected = reference.normal_equations(field.layout, *exact)
+    assert (found.used, found.inliers) == (expected.used, expected.inliers)
+    assert found.cost == pytest.approx(expected.cost, rel=CLOSE)
+    assert found.jtj.dtype == found.jtr.dtype == torch.float64
+    assert relative_rms(found.jtj, expected.jtj) < CLOSE
+    assert relative_rms(found.jtr, expected.jtr) < CLOSE
+
+
+def test_inputs_need_not_be_contiguous():
+    field, (c2w, rays) = make_field(), make_rays(12, 5)
+    wide = replace(rays, z=torch.cat([rays.z, rays.z], 1)[:, ::2])
+    straight = replace(wide, z=wide.z.contiguous())
+    mine = gpu.step(field.layout, field.params, c2w.mT.contiguous().mT, wide, WEIGHTS, None, True)
+    theirs = gpu.step(field.layout, field.params, c2w, straight, WEIGHTS, None, True)
+    assert torch.equal(mine.d_c2w, theirs.d_c2w)
+
+
+def test_numbers_that_are_not_numbers_stay_in_their_place():
+    field, points = make_field(), make_points(20)
+    clean, _ = gpu.values(field.layout, field.params, points)
+    spoiled = points.clone()
+    spoiled[7], spoiled[9, 1] = float("nan"), float("inf")
+    sdf, _ = gpu.values(field.layout, field.params, spoiled)
+    keep = torch.ones(20).bool()
+    keep[[7, 9]] = False
+    assert torch.equal(sdf[keep], clean[keep])
+
+
+def test_a_layout_is_uploaded_once_and_forgotten_with_it():
+    field = make_field()
+    for _ in range(2):
+        gpu.values(field.layout, field.params, make_points(1))
+    assert len([key for key in gpu._layouts if key[0] == id(field.layout)]) == 1
+    before = len(gpu._layouts)
+    del field
+    assert len(gpu._layouts) == before - 1
