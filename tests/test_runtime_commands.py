@@ -3,6 +3,7 @@
 import json
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import yaml
 from fake_slam import Behaviour, FakeSequence
 from runtime_watch import Watch, running
 
+from ecslam import config as configuration
 from ecslam.messages import (
     Export,
     Exported,
@@ -168,6 +170,21 @@ def test_restart_begins_again_beside_the_first_run(tmp_path):
         assert len(made) == 4
     first = json.loads((out / "summary.json").read_text())
     assert first["frames"] == 8
+
+
+def test_a_restart_and_a_preset_keep_what_the_layout_asks_for(tmp_path, monkeypatch):
+    (tmp_path / "layouts").mkdir()
+    (tmp_path / "layouts" / "fake.yaml").write_text("depth_far_m: 2.5\ntracking:\n  rays: 123\n")
+    monkeypatch.setattr(configuration, "config_folder", lambda: tmp_path)
+    monkeypatch.setattr(configuration, "load_preset", lambda name: replace(configuration.Config(), preset=name))
+    monkeypatch.setattr(configuration, "preset_names", lambda: ["lite", "full"])
+    with running(tmp_path / "run", paused_at=2) as (_, watch, made):
+        assert watch.ask(LoadPreset("full")).error == ""
+        watch.go(Step(), State.PAUSED)
+        assert made[0].config.tracking.rays == 123
+        watch.go(Restart(preset="full"), State.FINISHED)
+        assert made[1].config.depth_far_m == 2.5
+        assert made[1].config.tracking.rays == 123
 
 
 def test_the_speed_limit_holds_and_lifting_it_takes_effect_at_once(tmp_path):

@@ -75,6 +75,7 @@ class Control:
         self._jobs_waiting = jobs_waiting
         self._last_id = 0
         self._work: deque[tuple[int, Command]] = deque()
+        self._layout = ""
         self._frames_per_s = 0.0
         self._pause_on_loop = False
         self.config = self._started_with = config
@@ -106,7 +107,7 @@ class Control:
         if isinstance(command, (Pause, Resume, Step, RunTo, Stop)):
             self._steer(command)
         elif isinstance(command, Restart):
-            self.restart_config(command)
+            self.restart_config(command, self._layout)
             self._restart = command
             self._leave_at = 0.0
         elif isinstance(command, (LoadPreset, Tune)):
@@ -164,7 +165,7 @@ class Control:
 
     def _tuned(self, command: LoadPreset | Tune) -> Config:
         if isinstance(command, LoadPreset):
-            other = configuration.load_preset(command.name)
+            other = configuration.for_layout(configuration.load_preset(command.name), self._layout)
             return replace(
                 self.config,
                 preset=command.name,
@@ -180,8 +181,8 @@ class Control:
             nested = {part: nested}
         return configuration.apply(self.config, {group: nested}, "tune")
 
-    def restart_config(self, command: Restart) -> Config:
-        """The configuration of the run that ``command`` asks for. Raises InputError."""
+    def restart_config(self, command: Restart, layout: str) -> Config:
+        """The configuration of the run that ``command`` asks for, on a sequence of ``layout``. Raises InputError."""
         if command.sequence is not None and command.sequence not in self._sequences:
             raise InputError(
                 f"sequence {command.sequence!r} is not on offer; give its folder as a data root at the start"
@@ -190,15 +191,17 @@ class Control:
             raise InputError(f"preset {command.preset!r} is not on offer; there are: {', '.join(self._presets)}")
         wanted = self._started_with
         if command.preset is not None:
-            wanted = replace(configuration.load_preset(command.preset), seed=wanted.seed, schedule=wanted.schedule)
+            other = configuration.for_layout(configuration.load_preset(command.preset), layout)
+            wanted = replace(other, seed=wanted.seed, schedule=wanted.schedule)
         given = {"seed": command.seed, "schedule": command.schedule}
         return configuration.apply(wanted, {k: v for k, v in given.items() if v is not None}, "restart")
 
     # ---- for the engine thread ------------------------------------------------------------------------------------
 
-    def begin(self, config: Config, total: int, position: int = 0) -> None:
-        """A run over ``total`` frames is about to start at ``position``; commands for it are taken from now on."""
+    def begin(self, config: Config, layout: str, total: int, position: int = 0) -> None:
+        """A run over ``total`` frames of a ``layout`` is about to start at ``position``; its commands are taken now."""
         with self._changed:
+            self._layout = layout
             self.config = self._started_with = config
             self.position, self._total = position, total
             self.over = self._stop = self._paused = self._announced = False
@@ -253,11 +256,11 @@ class Control:
         with self._changed:
             self.over, self._stop = True, False
 
-    def take_restart(self) -> tuple[Restart, Config]:
-        """The restart that was asked for, and its configuration."""
+    def take_restart(self) -> Restart:
+        """The restart that was asked for; it is over with the next ``begin``."""
         with self._changed:
             assert self._restart is not None
-            return self._restart, self.restart_config(self._restart)
+            return self._restart
 
     def take_work(self, kinds: tuple[type, ...] = ()) -> list[tuple[int, Command]]:
         """Waiting work with command ids, oldest first; only commands of ``kinds`` where given."""

@@ -74,7 +74,7 @@ class Engine:
         self._plan, self._run = plan, self._open_run(plan, resumed)
         self._workshop = workshop = Workshop(self._feed)
         self._control = Control(config, self._feed.publish, self._sequences, self.presets, lambda: workshop.waiting)
-        self._control.begin(config, len(plan.sequence), self._run.tally.position)
+        self._control.begin(config, opened.layout, len(plan.sequence), self._run.tally.position)
 
     @classmethod
     def resume(cls, folder: Path, *, sequence: Sequence | None = None, **options: Any) -> Engine:
@@ -157,17 +157,18 @@ class Engine:
             self._workshop.close()
 
     def _restart(self) -> Turn:
-        command, config = self._control.take_restart()
-        plan = replace(self._plan, config=config, out=_beside(self._plan.out))
+        command = self._control.take_restart()
+        plan = replace(self._plan, out=_beside(self._plan.out))
         self.error = self.summary = None
         try:
             if command.sequence is not None and command.sequence != plan.address:
                 opened = self._given.get(command.sequence) or self._open_sequence(command.sequence)
                 plan = replace(plan, sequence=opened, address=command.sequence, frames="")
-            self._control.begin(config, len(plan.sequence))
+            plan = replace(plan, config=self._control.restart_config(command, plan.sequence.layout))
+            self._control.begin(plan.config, plan.sequence.layout, len(plan.sequence))
             self._plan, self._run = plan, self._open_run(plan)
         except (InputError, OSError) as error:
-            self._control.begin(config, 0)
+            self._control.begin(plan.config, plan.sequence.layout, 0)
             self._control.end()
             self._failed(error)
             self._show(State.FAILED, str(error))
