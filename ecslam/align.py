@@ -10,19 +10,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from . import se3
 from .config import Config
 from .field import TsdfField
 from .kernels import AlignSettings, Backend, NormalEquations
 from .observed import ObservedVoxels
-from .pixels import Pixels
+from .pixels import Pixels, Points
 
 DAMPING = (1e-4, 1e-8, 1e4)
+SETTLED = 1e-4
+COARSE_STRIDE = 4
 WIDE_GRADIENT = (0.3, 2.0)
 LEAST_KNOWN = 100
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255
@@ -35,10 +36,8 @@ class Surface(Protocol):
         """Signed distance [N] in metres at world points [N, 3], and whether it is known there."""
         ...
 
-    def normal_equations(
-        self, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
-    ) -> NormalEquations:
-        """See ``kernels.reference.normal_equations``; c2w [4, 4] and camera points [N, 3] lie on the CPU."""
+    def normal_equations(self, c2w: NDArray[np.float64], points: Points, settings: AlignSettings) -> NormalEquations:
+        """See ``kernels.reference.normal_equations``; the sums lie on the CPU."""
         ...
 
 
@@ -57,13 +56,12 @@ class LearnedSurface:
         sdf, _ = self.kernels.values(self.field.layout, self.field.params, at)
         return sdf.cpu().numpy() * np.float32(self.truncation_m), self.observed.contains(points)
 
-    def normal_equations(
-        self, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
-    ) -> NormalEquations:
+    def normal_equations(self, c2w: NDArray[np.float64], points: Points, settings: AlignSettings) -> NormalEquations:
         """See ``Surface``."""
-        device = self.field.device
-        pose, points, luminance = c2w.to(device).float(), points.to(device), luminance.to(device)
-        found = self.kernels.normal_equations(self.field.layout, self.field.params, pose, points, luminance, settings)
+        device, layout, params = self.field.device, self.field.layout, self.field.params
+        pose = torch.from_numpy(c2w).float().to(device)
+        local, light = points.local.to(device), points.light.to(device)
+        found = self.kernels.normal_equations(layout, params, pose, local, light, settings)
         return replace(found, jtj=found.jtj.cpu(), jtr=found.jtr.cpu())
 
 
@@ -93,14 +91,6 @@ def stages(config: Config) -> list[AlignSettings]:
     return out
 
 
-@dataclass(frozen=True)
-class Points:
-    """Measured points to align. local: float32 [N, 3], camera coordinates in metres. light: float32 [N] in 0..1."""
-
-    local: Tensor
-    light: Tensor
-
-
 def known_points(surface: Surface, pixels: Pixels, guess: NDArray[np.float64]) -> Points:
     """The measured points of ``pixels`` that lie, seen from ``guess`` [4, 4], where the surface is known; all of them
     when that leaves too few."""
@@ -119,7 +109,7 @@ def align(surface: Surface, points: Points, guess: NDArray[np.float64], config: 
 def cost_at(surface: Surface, points: Points, c2w: NDArray[np.float64], config: Config) -> float:
     """What ``align`` minimises in its last stage, at c2w [4, 4]: robust, per point, in squared metres."""
     last = stages(config)[-1]
-    found = surface.normal_equations(torch.from_numpy(c2w), points.local, points.light, last)
+    found = surface.normal_equations(c2w, points, last)
     return objective(found, len(points.local), last) / max(len(points.local), 1)
 
 
@@ -130,30 +120,41 @@ def descend(
     settings: Sequence[AlignSettings],
     iterations: int,
 ) -> Alignment:
-    """Levenberg-Marquardt from ``guess`` [4, 4] through all ``settings``, at most ``iterations`` steps with each."""
-    c2w = torch.from_numpy(guess)
-    total, cost = len(points.local), 0.0
+    """Levenberg-Marquardt from ``guess`` [4, 4] through all ``settings``, at most ``iterations`` steps with each; all
+    stages but the last take every fourth point."""
+    everything, c2w, total, cost = points, guess, 0, 0.0
     for stage in settings:
-        equations = surface.normal_equations(c2w, points.local, points.light, stage)
+        points = everything if stage is settings[-1] else everything.every(COARSE_STRIDE)
+        total = len(points.local)
+        equations = surface.normal_equations(c2w, points, stage)
         damping = DAMPING[0]
         for _ in range(iterations):
             if equations.used < 6:
                 break
-            diagonal = torch.diag(equations.jtj.diagonal() + 1e-9)
-            move = -torch.linalg.solve(equations.jtj + damping * diagonal, equations.jtr)
-            trial = se3.retract(c2w, move)
-            found = surface.normal_equations(trial, points.local, points.light, stage)
+            jtj = equations.jtj.numpy()
+            move = -np.linalg.solve(jtj + damping * np.diag(jtj.diagonal() + 1e-9), equations.jtr.numpy())
+            trial = moved(c2w, move)
+            found = surface.normal_equations(trial, points, stage)
             before, after = objective(equations, total, stage), objective(found, total, stage)
+            size = float(np.abs(move).max())
             if after < before:
                 c2w, equations, damping = trial, found, max(damping / 3, DAMPING[1])
-                if before - after < 1e-5 * before or float(move.abs().max()) < 1e-5:
+                if before - after < SETTLED * before or size < 1e-5:
                     break
             else:
                 damping *= 10
-                if damping > DAMPING[2] or float(move.abs().max()) < 1e-6:
+                if damping > DAMPING[2] or size < 1e-6:
                     break
         cost = objective(equations, total, stage)
-    return Alignment(c2w.numpy(), cost / max(total, 1))
+    return Alignment(c2w, cost / max(total, 1))
+
+
+def moved(c2w: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``se3.retract`` of one pose [4, 4] by xi [6], without the cost of torch's small tensors."""
+    out = c2w.copy()
+    out[:3, :3] = cv2.Rodrigues(xi[3:])[0] @ c2w[:3, :3]
+    out[:3, 3] += xi[:3]
+    return out
 
 
 def objective(equations: NormalEquations, total: int, settings: AlignSettings) -> float:

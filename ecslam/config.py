@@ -46,12 +46,14 @@ class FieldConfig:
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """Depths along a ray: ``uniform`` over it and ``near_depth`` within ``depth_range_m`` of the measured depth."""
+    """Depths along a ray: ``uniform`` over it and ``near_depth`` within ``depth_range_m`` of the measured depth.
+    without_depth: whether mapping takes rays that have no measured depth."""
 
     uniform: int = _number(32, 0, 512)
     near_depth: int = _number(11, 1, 512)
     depth_range_m: float = _number(0.10, 1e-3, 1.0)
     near_m: float = _number(0.05, 0.0, 10.0)
+    without_depth: bool = True
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ class Mapper:
             self._optimiser.step()
             field.params.beta.clamp_(min=MIN_BETA)
             if result.d_c2w is not None:
-                poses.step(result.d_c2w)
+                poses.step(result.d_c2w, 1 - iteration / iterations)
             last = result.losses
             first = last if iteration == 0 else first
         losses = dict(zip(LOSS_NAMES, last.tolist(), strict=True))

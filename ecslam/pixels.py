@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from .config import Config
 from .types import Frame, Intrinsics
@@ -40,6 +41,18 @@ class Pixels:
     def take(self, index: NDArray[np.integer]) -> Pixels:
         """The pixels at ``index``."""
         return Pixels(self.direction[index], self.depth[index], self.color[index], self.feature[index])
+
+
+@dataclass(frozen=True)
+class Points:
+    """Measured points to align. local: float32 [N, 3], camera coordinates in metres. light: float32 [N] in 0..1."""
+
+    local: Tensor
+    light: Tensor
+
+    def every(self, stride: int) -> Points:
+        """Every ``stride``-th point."""
+        return Points(self.local[::stride].contiguous(), self.light[::stride].contiguous())
 
 
 def feature_points(color: NDArray[np.uint8], config: Config, limit: int) -> NDArray[np.int64]:

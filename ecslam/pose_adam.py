@@ -25,12 +25,12 @@ class PoseAdam:
         """Never move the poses at ``rows``."""
         self._lr[rows] = 0.0
 
-    def step(self, d_c2w: Tensor) -> None:
-        """One update from gradients [P, 3, 4]."""
+    def step(self, d_c2w: Tensor, share: float = 1.0) -> None:
+        """One update from gradients [P, 3, 4] at ``share`` of the learning rate."""
         gradient = se3.tangent_gradient(self.c2w, d_c2w.to(self.c2w.dtype))
         self._count += 1
         self._mean.mul_(BETA1).add_(gradient, alpha=1 - BETA1)
         self._square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
         mean = self._mean / (1 - BETA1**self._count)
         square = self._square / (1 - BETA2**self._count)
-        self.c2w = se3.retract(self.c2w, -self._lr * mean / (square.sqrt() + EPSILON))
+        self.c2w = se3.retract(self.c2w, -share * self._lr * mean / (square.sqrt() + EPSILON))

@@ -3,15 +3,17 @@ needs no training (Curless and Levoy 1996; sparse blocks as in Niessner et al. 2
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from .kernels import AlignSettings, NormalEquations, fusion
+from .pixels import Points
 from .types import Frame, Intrinsics
 
 STRIDE = 4
@@ -22,7 +24,7 @@ class FusedVolume:
     """Sparse voxels of ``voxel_m`` metres with a truncated distance; the engine thread alone writes it."""
 
     def __init__(self, voxel_m: float, truncation_m: float) -> None:
-        self.voxel_m, self.truncation_m = voxel_m, truncation_m
+        self.voxel_m, self.truncation_m = self._lengths = voxel_m, truncation_m
         self.used = 0
         self._blocks = _allocate(ROWS)
         self._stamp = np.full(ROWS, -1, np.int64)
@@ -51,7 +53,11 @@ class FusedVolume:
                 break
             self._grow()
             self._now += 1
-        fusion.integrate(self._blocks, self._listed[:listed], view, self.voxel_m, self.truncation_m)
+        halves = np.array_split(self._listed[:listed], torch.get_num_threads())
+        parts = [_pool().submit(fusion.integrate, self._blocks, rows, view, *self._lengths) for rows in halves[1:]]
+        fusion.integrate(self._blocks, halves[0], view, *self._lengths)
+        for part in parts:
+            part.result()
 
     def _grow(self) -> None:
         self._load(self._blocks.place[: self.used], self._blocks.voxels[: self.used], 2 * len(self._blocks.place))
@@ -79,16 +85,20 @@ class FusedVolume:
         )
         return distance, known
 
-    def normal_equations(
-        self, c2w: Tensor, points: Tensor, luminance: Tensor, settings: AlignSettings
-    ) -> NormalEquations:
+    def normal_equations(self, c2w: NDArray[np.float64], points: Points, settings: AlignSettings) -> NormalEquations:
         """Sums for one Gauss-Newton step, as ``kernels.reference.normal_equations`` has them for the learned map."""
         sums = np.zeros(45)
         numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
-        pose = c2w.detach().to(torch.float64).contiguous().numpy()
-        fusion.align_sums(self._blocks, pose, points.numpy(), luminance.numpy(), self.voxel_m, numbers, sums)
-        total = torch.from_numpy(sums)
-        return NormalEquations(total[:36].reshape(6, 6), total[36:42], float(sums[42]), int(sums[44]), int(sums[43]))
+        local, light = points.local.numpy(), points.light.numpy()
+        fusion.align_sums(self._blocks, np.ascontiguousarray(c2w), local, light, self.voxel_m, numbers, sums)
+        upper = np.triu(sums[:36].reshape(6, 6))
+        jtj = torch.from_numpy(upper + np.triu(upper, 1).T)
+        return NormalEquations(jtj, torch.from_numpy(sums[36:42]), float(sums[42]), int(sums[44]), int(sums[43]))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(torch.get_num_threads(), "fusion")
 
 
 def _allocate(rows: int) -> fusion.Blocks:

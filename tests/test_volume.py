@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ecslam import se3, volume
-from ecslam.align import align, cost_at, known_points, stages
+from ecslam.align import align, cost_at, known_points, moved, stages
 from ecslam.config import Config
 from ecslam.pixels import spread_pixels
 from ecslam.types import Frame, Intrinsics
@@ -122,7 +122,7 @@ def test_sums_are_the_derivative_of_the_cost(colour):
     points = known_points(found, measured(corner(), np.eye(4)), at)
     settings = replace(stages(CONFIG)[0], colour_weight=colour, gradient_low=0.0, gradient_high=1e9, tsdf_limit=1e9)
     c2w = torch.from_numpy(at)
-    sums = found.normal_equations(c2w, points.local, points.light, settings)
+    sums = found.normal_equations(at, points, settings)
     assert sums.used > 500
     assert sums.inliers <= sums.used
     torch.testing.assert_close(sums.jtj, sums.jtj.T)
@@ -130,8 +130,8 @@ def test_sums_are_the_derivative_of_the_cost(colour):
     for k in range(6):
         step = torch.zeros(6, dtype=torch.float64)
         step[k] = 1e-5
-        up = found.normal_equations(se3.retract(c2w, step), points.local, points.light, settings)
-        down = found.normal_equations(se3.retract(c2w, -step), points.local, points.light, settings)
+        up = found.normal_equations(se3.retract(c2w, step).numpy(), points, settings)
+        down = found.normal_equations(se3.retract(c2w, -step).numpy(), points, settings)
         slope = (up.cost - down.cost) / 2e-5
         assert slope == pytest.approx(float(sums.jtr[k]), rel=0.03, abs=2e-3 * float(sums.jtr.abs().max()))
 
@@ -157,3 +157,9 @@ def test_colour_holds_what_a_plain_wall_leaves_free():
     without = align(found, points, guess, replace(CONFIG, align=replace(CONFIG.align, colour_weight_m=0.0))).c2w
     assert np.linalg.norm(with_colour[:3, 3] - true[:3, 3]) < 3e-3
     assert np.linalg.norm(without[:3, 3] - true[:3, 3]) > 0.01
+
+
+def test_moved_is_retract():
+    c2w, xi = pose((10, -20, 30), (1, 2, 3)), np.array([0.1, -0.2, 0.3, 0.4, 0.1, -0.9])
+    expected = se3.retract(torch.from_numpy(c2w), torch.from_numpy(xi)).numpy()
+    np.testing.assert_allclose(moved(c2w, xi), expected, atol=1e-12)

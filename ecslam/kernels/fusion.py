@@ -25,6 +25,7 @@ NORMAL_BASELINE_M = 0.03
 NORMAL_STRIDE = 2
 
 OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}}
+INLINE = {**OPTIONS, "inline": "always"}  # calls would count references to every array they pass
 
 
 class Blocks(NamedTuple):
@@ -48,7 +49,7 @@ class View(NamedTuple):
     c2w: NDArray[np.float64]
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def slot_of(keys, key):
     """Where ``key`` is in the table, or the free slot where it belongs."""
     mask = keys.size - 1
@@ -59,7 +60,7 @@ def slot_of(keys, key):
     return slot
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def block_key(x, y, z):
     """The key of the block at integer block coordinates."""
     return ((np.int64(x) + HALF) << (2 * BITS)) | ((np.int64(y) + HALF) << BITS) | (np.int64(z) + HALF)
@@ -208,16 +209,17 @@ def integrate(blocks, rows, view, voxel, truncation):
             voxels[cell, 2] = np.int16(min(held + added, MAX_WEIGHT))
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def row_of(blocks, x, y, z):
     """The row of the block at integer block coordinates, -1 where there is none."""
     slot = slot_of(blocks.keys, block_key(x, y, z))
     return -1 if blocks.keys[slot] == EMPTY else np.int64(blocks.row[slot])
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def corners(blocks, ix, iy, iz, distance, light):
     """The eight voxels from lattice point (ix, iy, iz) on, x fastest; False where any of them is unseen."""
+    voxels = blocks.voxels
     x, y, z = ix >> 3, iy >> 3, iz >> 3
     row = row_of(blocks, x, y, z)
     a, b, c = ix & 7, iy & 7, iz & 7
@@ -231,14 +233,14 @@ def corners(blocks, ix, iy, iz, distance, light):
             at = row_of(blocks, x + (kx >> 3), y + (ky >> 3), z + (kz >> 3))
         if at < 0:
             return False
-        voxel = blocks.voxels[at, (kx & 7) | ((ky & 7) << 3) | ((kz & 7) << 6)]
-        if voxel[2] == 0:
+        cell = (kx & 7) | ((ky & 7) << 3) | ((kz & 7) << 6)
+        if voxels[at, cell, 2] == 0:
             return False
-        distance[corner], light[corner] = voxel[0], voxel[1]
+        distance[corner], light[corner] = voxels[at, cell, 0], voxels[at, cell, 1]
     return True
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def trilinear(values, tx, ty, tz, out, first):
     """Value and gradient (per lattice step) between eight corner values into ``out`` from ``first`` on."""
     c00, d00 = values[0] + tx * (values[1] - values[0]), values[1] - values[0]
@@ -253,7 +255,7 @@ def trilinear(values, tx, ty, tz, out, first):
     out[first + 3] = c1 - c0
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def sample(blocks, x, y, z, voxel, truncation, distance, light, out):
     """Trilinear distance (metres), its gradient, luminance, its gradient into ``out`` [8]; False where any of the eight
     corners is unseen. distance, light: room for eight numbers."""
@@ -280,7 +282,7 @@ def sample_points(blocks, points, voxel, truncation, distance, known):
         distance[i] = out[0]
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def add_residual(sums, residual, kernel, rx, ry, rz, gx, gy, gz):
     """Add one Geman-McClure weighted residual with position gradient g at lever arm r; returns its weight."""
     share = kernel * kernel / (kernel * kernel + residual * residual)
@@ -288,7 +290,7 @@ def add_residual(sums, residual, kernel, rx, ry, rz, gx, gy, gz):
     j = (gx, gy, gz, ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx)
     for a in range(6):
         scaled = weight * j[a]
-        for b in range(6):
+        for b in range(a, 6):
             sums[6 * a + b] += scaled * j[b]
         sums[36 + a] += scaled * residual
     sums[42] += 0.5 * residual * residual * share
@@ -297,7 +299,7 @@ def add_residual(sums, residual, kernel, rx, ry, rz, gx, gy, gz):
 
 @njit(**OPTIONS)
 def align_sums(blocks, c2w, points, light, voxel, settings, sums):
-    """Gauss-Newton sums [45] of camera points: jtj (36), jtr (6), cost, inliers, used."""
+    """Gauss-Newton sums [45] of camera points: jtj (36, the upper triangle alone), jtr (6), cost, inliers, used."""
     truncation, kernel, limit, low, high, colour, colour_kernel = settings
     distances, lights, out = np.empty(8), np.empty(8), np.empty(8)
     for i in range(points.shape[0]):
