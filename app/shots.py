@@ -11,7 +11,7 @@ from typing import Any
 from ecslam.messages import RunTo
 from ecslam.types import InputError
 
-from .browser import dismiss_toasts, launch
+from .browser import dismiss_toasts, launch, new_page
 from .server import Dashboard, view
 
 DESKTOP, PHONE = (1440, 860), (390, 780)
@@ -48,7 +48,7 @@ def _pictures(
 def _take_one(
     browser: Any, dashboard: Dashboard, size: tuple[int, int], act: Callable[[Any, Dashboard], None], path: Path
 ) -> Path:
-    page = browser.new_page(viewport={"width": size[0], "height": size[1]}, device_scale_factor=1.5)
+    page = new_page(browser, *size, sharpness=1.5)
     page.goto(dashboard.url)
     page.locator(".ec-row b").wait_for()
     page.wait_for_timeout(SETTLE_MS)

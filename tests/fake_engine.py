@@ -106,7 +106,7 @@ class FakeEngine:
         self.log: list[m.Command] = []
         self._inbox, self._ids, self._lock = queue.SimpleQueue(), 0, threading.Lock()
         self._feed = Feed()
-        self._gt, self._mesh = walk(frames), room_mesh()
+        self._gt, self._mesh = walk(frames), room_mesh(0.14)
         self._sequence, self._preset = "synthetic/studio", "lite"
         self._reset()
         self._alive = True

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import trimesh
 from ecslam_app import server
-from ecslam_app.browser import dismiss_toasts, install_chromium, launch
+from ecslam_app.browser import PATIENCE_MS, dismiss_toasts, install_chromium, launch, new_page
 from PIL import Image
 
 from ecslam import messages as m
 from tests.fake_engine import FakeEngine, write_run
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-WAIT_MS = 20_000
 
 
 @pytest.fixture(scope="session")
@@ -34,13 +33,13 @@ def browser():
 class Visit:
     """One tab on a dashboard, with what its console complained about."""
 
-    def __init__(self, browser, dashboard, width=1280, height=760):
+    def __init__(self, browser, dashboard, width=1060, height=640):
         self.errors, self.dashboard = [], dashboard
-        self.page = browser.new_page(viewport={"width": width, "height": height})
+        self.page = new_page(browser, width, height)
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)
         self.page.goto(dashboard.url)
-        self.page.locator(".ec-row b").wait_for(timeout=WAIT_MS)
+        self.page.locator(".ec-row b").wait_for()
         self.wait(lambda: dashboard.hub.scene.mesh is not None)
         self.page.wait_for_timeout(1500)
         dismiss_toasts(self.page)
@@ -65,7 +64,7 @@ class Visit:
     def state(self, text):
         self.wait(lambda: self.page.locator(".ec-chip", has_text=text).count() == 1)
 
-    def wait(self, condition, seconds=20):
+    def wait(self, condition, seconds=120):
         for _ in range(seconds * 20):
             if condition():
                 return
@@ -74,7 +73,7 @@ class Visit:
         raise AssertionError(f"waited in vain; the page says {shown!r}, the engine {current}")
 
     def download(self, button):
-        with self.page.expect_download(timeout=60_000) as download:
+        with self.page.expect_download(timeout=PATIENCE_MS) as download:
             self.press(button)
         return download.value
 
@@ -152,7 +151,7 @@ def test_switch_preset_and_start_over(live):
     visit.page.get_by_role("option", name="full", exact=True).click()
     visit.press("Restart")
     visit.wait(lambda: m.Restart("synthetic/studio", "full", 0, "strict") in engine.log)
-    visit.page.locator(".ec-name", has_text="full").wait_for(timeout=WAIT_MS)
+    visit.page.locator(".ec-name", has_text="full").wait_for()
     assert engine.latest().preset == "full"
 
 
@@ -165,7 +164,7 @@ def test_exports_arrive_in_the_browser(live, tmp_path):
     mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
     assert len(mesh.faces) > 1000
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
-    visit.page.get_by_text(str(engine.run_folder)).first.wait_for(timeout=WAIT_MS)
+    visit.page.get_by_text(str(engine.run_folder)).first.wait_for()
     visit.download("Export trajectory").save_as(tmp_path / "poses.txt")
     assert len((tmp_path / "poses.txt").read_text().splitlines()) == visit.frame
     visit.download("Save screenshot").save_as(tmp_path / "shot.png")
@@ -179,7 +178,7 @@ def test_html_replay_plays_by_itself(live, browser, tmp_path):
     visit.state("Paused")
     visit.tab("Export")
     visit.download("Save HTML replay").save_as(tmp_path / "replay.html")
-    page, errors = browser.new_page(viewport={"width": 900, "height": 600}), []
+    page, errors = new_page(browser, 600, 400), []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(f"file://{tmp_path / 'replay.html'}")
     page.wait_for_timeout(4000)
@@ -235,7 +234,7 @@ def test_finished_run_is_scrubbed_and_its_loop_inspected(browser, tmp_path):
         before = visit.camera
         visit.tab("Loops")
         visit.press("Next event")
-        visit.page.get_by_text("met keyframes").wait_for(timeout=WAIT_MS)
+        visit.page.get_by_text("met keyframes").wait_for()
         visit.page.wait_for_timeout(1500)
         assert np.linalg.norm(visit.camera - before) > 0.3
         assert hue_count(visit.pixels(), 160) > 20, "the links are green"
