@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from ecslam.messages import (
     Ack,
@@ -32,6 +31,7 @@ from ecslam.messages import (
     Step,
 )
 from ecslam.runtime.feed import Feed, FeedSubscription
+from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.types import InputError
 
 from .history import FIGURES, History
@@ -196,7 +196,7 @@ def export(run: Run, command: Export) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if command.kind == "mesh" and command.format in ("ply", "glb", "obj") and run.meshes:
         mesh, path = load_mesh(run.meshes[max(run.meshes)]), folder / f"mesh.{command.format}"
-        trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False).export(path)
+        path.write_bytes(mesh_bytes(mesh, command.format))
         return path
     if command.kind == "trajectory":
         path = folder / f"trajectory_{command.format or 'tum'}.txt"

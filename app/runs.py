@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +16,7 @@ import viser.transforms as vt
 from numpy.typing import NDArray
 
 from ecslam.messages import KeyframeView, LoopEvent
+from ecslam.runtime.files import read_lines
 from ecslam.types import InputError, Mesh
 
 from .geometry import wxyz
@@ -57,7 +57,7 @@ def load_run(folder: Path) -> Run:
     """Read a run folder. Raises InputError when it is not one."""
     if not (folder / "metrics.jsonl").is_file():
         raise InputError(f"{folder}: not a run folder (no metrics.jsonl); give the --out folder of `ecslam run`")
-    rows = tuple(row for row in _json_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
+    rows = tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
     if not rows:
         raise InputError(f"{folder / 'metrics.jsonl'}: holds no frame; the run ended before its first one")
     summary = _json(folder / "summary.json")
@@ -68,7 +68,7 @@ def load_run(folder: Path) -> Run:
     trajectory = _poses_at(folder / "trajectory.txt", timestamps)
     if trajectory is None or np.isnan(trajectory).any():
         trajectory = tracked
-    events = [e for e in _json_lines(folder / "events.jsonl") if e.get("type") == "loop"]
+    events = [e for e in read_lines(folder / "events.jsonl") if e.get("type") == "loop"]
     return Run(
         folder=folder,
         summary=summary,
@@ -124,19 +124,6 @@ def _json(path: Path) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _json_lines(path: Path) -> Iterable[dict[str, Any]]:
-    """The lines that can be read; the last one of a killed run may be cut short."""
-    if not path.is_file():
-        return
-    for line in path.read_text("utf-8", "replace").splitlines():
-        try:
-            value = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(value, dict):
-            yield value
-
-
 def _poses_at(path: Path, timestamps: Array) -> Array | None:
     """Poses [n, 4, 4] of a TUM file at the given times; NaN where it has none within a millisecond."""
     if not path.is_file():
@@ -158,7 +145,7 @@ def _poses_at(path: Path, timestamps: Array) -> Array | None:
 
 
 def _keyframes(folder: Path, rows: tuple[dict[str, Any], ...], trajectory: Array) -> tuple[KeyframeView, ...]:
-    pictures = {int(k["frame"]): k for k in _json_lines(folder / "keyframes.jsonl") if "frame" in k}
+    pictures = {int(k["frame"]): k for k in read_lines(folder / "keyframes.jsonl") if "frame" in k}
     out = []
     for row, c2w in zip(rows, trajectory, strict=True):
         if row.get("keyframe"):

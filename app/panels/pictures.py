@@ -14,7 +14,7 @@ from ecslam.messages import Event, FramePictures, KeyframeView, RequestPictures,
 from ..hub import Hub
 from ..panel import BasePanel
 
-EVERY_S = 1.0
+EVERY_S = 3.0
 _ORDER = (
     ("color", "colour"),
     ("depth", "depth"),
@@ -26,7 +26,7 @@ _ORDER = (
 
 
 class Panel(BasePanel):
-    """The pictures; rendered by the engine about once a second while somebody looks."""
+    """The pictures; the engine renders them between two frames, so it is asked every few seconds only."""
 
     tab, order = "Pictures", 10
 

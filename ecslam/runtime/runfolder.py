@@ -6,7 +6,8 @@ config.yaml      the resolved configuration
 trajectory.txt   TUM format (timestamp tx ty tz qx qy qz qw), final poses, one line for each frame that was processed
 groundtruth.txt  the same for the frames that have ground truth; absent without any
 metrics.jsonl    a line for each frame, as it was then: frame, timestamp, c2w (12 numbers, the upper 3x4 row by row),
-                 tracked, lost, keyframe, window, losses, track_ms, map_ms, ate_cm
+                 tracked, lost, keyframe, window, window_c2w (where its mapping left the window's keyframes), losses,
+                 track_ms, map_ms, ate_cm
 events.jsonl     type is "loop" (with the fields of LoopEvent) or "notice" (level, text, frame)
 keyframes.jsonl  frame, c2w (12 numbers, when it was made), thumbnail (relative path)
 thumbnails/      NNNNNN.jpg, at most 160 pixels wide, by frame
