@@ -28,26 +28,30 @@ def sum_and_difference(a, b):
     return a + b, a - b
 
 
+def halves(a, b):
+    return a[:2].float(), b[:2].float()
+
+
 def pair(x):
     return torch.tensor([x, 2 * x]), torch.tensor([1.0, x])
 
 
 def test_the_second_call_is_recorded_and_later_ones_replay_with_their_own_inputs():
     graphs = FakeGraphs()
-    recorder = Recorder(sum_and_difference, capture=graphs.capture)
+    recorder = Recorder(capture=graphs.capture)
     for call, x in enumerate((3.0, 5.0, 7.0)):
-        total, difference = recorder(*pair(x))
+        total, difference = recorder(sum_and_difference, *pair(x), key=0)
         assert torch.equal(total, sum_and_difference(*pair(x))[0])
         assert torch.equal(difference, sum_and_difference(*pair(x))[1])
         assert (graphs.recorded, graphs.replayed) == (min(call, 1), call)
 
 
 def test_results_are_the_callers_own():
-    recorder = Recorder(sum_and_difference, capture=FakeGraphs().capture)
-    recorder(*pair(1.0))
-    first = recorder(*pair(2.0))[0]
+    recorder = Recorder(capture=FakeGraphs().capture)
+    recorder(sum_and_difference, *pair(1.0), key=0)
+    first = recorder(sum_and_difference, *pair(2.0), key=0)[0]
     kept = first.clone()
-    recorder(*pair(9.0))
+    recorder(sum_and_difference, *pair(9.0), key=0)
     assert torch.equal(first, kept)
 
 
@@ -58,18 +62,18 @@ def test_every_call_takes_effect_once():
         state.add_(x)
         return (state.clone().expand(2), x.expand(2))
 
-    recorder = Recorder(add, capture=FakeGraphs().capture)
+    recorder = Recorder(capture=FakeGraphs().capture)
     for _ in range(4):
-        recorder(torch.ones(1), over=(state,))
+        recorder(add, torch.ones(1), key=0, over=(state,))
     assert state == 4
 
 
 @pytest.mark.parametrize("change", ["shape", "dtype", "key", "over"])
 def test_another_size_key_or_object_is_another_graph(change):
     graphs, old, new = FakeGraphs(), torch.zeros(1), torch.zeros(1)
-    recorder = Recorder(lambda x, y: (x[:2].float(), y[:2].float()), capture=graphs.capture)
+    recorder = Recorder(capture=graphs.capture)
     for _ in range(2):
-        recorder(*pair(1.0), key=1, over=(old,))
+        recorder(halves, *pair(1.0), key=1, over=(old,))
     assert graphs.recorded == 1
     a, b = pair(1.0)
     if change == "shape":
@@ -77,22 +81,22 @@ def test_another_size_key_or_object_is_another_graph(change):
     if change == "dtype":
         a, b = a.double(), b.double()
     key, over = (2 if change == "key" else 1), ((new,) if change == "over" else (old,))
-    recorder(a, b, key=key, over=over)
+    recorder(halves, a, b, key=key, over=over)
     assert graphs.replayed == 1
-    recorder(a, b, key=key, over=over)
+    recorder(halves, a, b, key=key, over=over)
     assert (graphs.recorded, graphs.replayed) == (2, 2)
 
 
 def test_the_least_recently_used_graph_is_forgotten():
     graphs = FakeGraphs()
-    recorder = Recorder(sum_and_difference, keep=2, capture=graphs.capture)
+    recorder = Recorder(keep=2, capture=graphs.capture)
     for key in ("a", "a", "b", "b", "a", "c", "c"):
-        recorder(*pair(1.0), key=key)
+        recorder(sum_and_difference, *pair(1.0), key=key)
     assert graphs.recorded == 3
-    recorder(*pair(1.0), key="a")
+    recorder(sum_and_difference, *pair(1.0), key="a")
     assert graphs.recorded == 3
-    recorder(*pair(1.0), key="b")
-    recorder(*pair(1.0), key="b")
+    recorder(sum_and_difference, *pair(1.0), key="b")
+    recorder(sum_and_difference, *pair(1.0), key="b")
     assert graphs.recorded == 4
 
 
@@ -103,9 +107,9 @@ def test_where_recording_fails_everything_runs_plainly():
         tried.append(device)
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    recorder = Recorder(sum_and_difference, capture=refuse)
+    recorder = Recorder(capture=refuse)
     for x in (1.0, 2.0, 3.0):
-        assert torch.equal(recorder(*pair(x))[0], sum_and_difference(*pair(x))[0])
+        assert torch.equal(recorder(sum_and_difference, *pair(x), key=0)[0], sum_and_difference(*pair(x))[0])
     assert len(tried) == 1
     assert "not permitted" in recorder.failure
 
@@ -114,14 +118,14 @@ def test_a_mistake_of_the_function_itself_is_not_swallowed():
     def wrong(x):
         raise ValueError("wrong")
 
-    recorder = Recorder(wrong)
+    recorder = Recorder(capture=FakeGraphs().capture)
     for _ in range(2):
         with pytest.raises(ValueError, match="wrong"):
-            recorder(torch.zeros(1))
+            recorder(wrong, torch.zeros(1), key=0)
 
 
 def test_without_cuda_every_call_is_plain():
-    recorder = Recorder(sum_and_difference)
+    recorder = Recorder()
     for _ in range(3):
-        assert torch.equal(recorder(*pair(4.0))[1], sum_and_difference(*pair(4.0))[1])
+        assert torch.equal(recorder(sum_and_difference, *pair(4.0), key=0)[1], sum_and_difference(*pair(4.0))[1])
     assert recorder.failure == ""

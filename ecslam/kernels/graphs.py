@@ -40,36 +40,39 @@ def capture_cuda(function: Callable[[], Tensors], device: torch.device) -> tuple
 
 
 class Recorder:
-    """Calls ``function``, and from the second call with the same sizes on replays it as a CUDA graph.
+    """Calls functions, and from the second call of one with the same sizes on replays it as a CUDA graph.
 
     The first call runs plainly, which also compiles kernels and fills caches, so nothing runs that was not asked for
     and a function may change what it holds in place. Without CUDA, or once recording has failed, every call is plain;
-    ``failure`` then says why. Results are copies. ``keep`` graphs are kept, the least recently used go first.
+    ``failure`` then says why. Results are copies. ``keep`` graphs are kept, the least recently used go first. One
+    thread may use it at a time.
     """
 
-    def __init__(self, function: Callable[..., Tensors], keep: int = 4, capture: Capture | None = None) -> None:
+    def __init__(self, keep: int = 4, capture: Capture | None = None) -> None:
         self.failure = ""
-        self._function, self._keep, self._capture = function, keep, capture
+        self._keep, self._capture = keep, capture
         self._held: dict[Hashable, _Held] = {}
 
-    def __call__(self, *inputs: Tensor, key: Hashable = None, over: tuple[object, ...] = ()) -> Tensors:
-        """The function's results for ``inputs`` (at least one).
+    def __call__(
+        self, function: Callable[..., Tensors], *inputs: Tensor, key: Hashable, over: tuple[object, ...] = ()
+    ) -> Tensors:
+        """``function(*inputs)``, with at least one input.
 
-        key: everything else that decides what is launched, by value. over: objects that hold the tensors which the
-        function reads or changes without being given them; another object means another graph.
+        key: which function it is, and all the values, beside the inputs' sizes, that decide what it launches. over:
+        objects with tensors that it reads or changes without being given them; another object means another graph.
         """
         device = inputs[0].device
         if self.failure or not (self._capture or device.type == "cuda"):
-            return self._function(*inputs)
+            return function(*inputs)
         sizes = tuple((t.shape, t.dtype, t.device) for t in inputs)
         whole = (key, sizes, tuple(id(held) for held in over))
         held = self._held.pop(whole, None)
         if held is None:
             self._remember(whole, _Held(over))
-            return self._function(*inputs)
+            return function(*inputs)
         self._remember(whole, held)
-        if held.replay is None and not self._record(held, inputs, device):
-            return self._function(*inputs)
+        if held.replay is None and not self._record(held, function, inputs, device):
+            return function(*inputs)
         assert held.replay is not None
         for mine, given in zip(held.inputs, inputs, strict=True):
             mine.copy_(given)
@@ -81,10 +84,10 @@ class Recorder:
             del self._held[oldest]
         self._held[whole] = held
 
-    def _record(self, held: _Held, inputs: Tensors, device: torch.device) -> bool:
+    def _record(self, held: _Held, function: Callable[..., Tensors], inputs: Tensors, device: torch.device) -> bool:
         mine = tuple(t.clone() for t in inputs)
         try:
-            held.replay, held.outputs = (self._capture or capture_cuda)(lambda: self._function(*mine), device)
+            held.replay, held.outputs = (self._capture or capture_cuda)(lambda: function(*mine), device)
         except RuntimeError as error:
             self.failure = f"no CUDA graph: {error}"
             self._held.clear()
