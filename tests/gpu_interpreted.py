@@ -1,8 +1,8 @@
 """The GPU kernels in Triton's interpreter against the float64 reference: every function, every gradient, ragged sizes.
 
 Not collected by itself: ``test_kernels_gpu.py`` runs it in a process of its own, since TRITON_INTERPRET=1 must be set
-before Triton is imported and then holds for the whole process. A block takes about a third of a second, so sizes are
-small.
+before Triton is imported and then holds for the whole process. The interpreter's time goes by blocks, about a third of
+a second each, so sizes are small and blocks are larger than on a GPU.
 """
 
 from dataclasses import fields, replace
@@ -34,6 +34,11 @@ FIELDS = {
     "odd": FieldConfig(levels=5, log2_table_size=10, blob_bins=7, init_scale=0.1),
     "wide": FieldConfig(levels=17, log2_table_size=14, blob_bins=4, init_scale=0.1),
 }
+
+
+@pytest.fixture(autouse=True)
+def large_blocks(monkeypatch):
+    monkeypatch.setattr(gpu, "BLOCK", 64)
 
 
 def assert_close(found, expected):
@@ -81,6 +86,12 @@ def test_step_and_render(count):
     c2w, rays = make_rays(count, 2)
     assert_step(make_field(), c2w, rays)
     assert_render(make_field(), c2w, rays)
+
+
+def test_the_block_that_runs_on_a_gpu(monkeypatch):
+    monkeypatch.undo()
+    assert gpu.BLOCK < 64
+    assert_step(make_field(), *make_rays(gpu.BLOCK + 1, 2))
 
 
 @pytest.mark.parametrize(("count", "samples"), [(3, 43), (70, 1)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from ._gpu_decoders import decode, into_features, into_hidden, layer_one, through_blob
+from ._gpu_decoders import OUTPUTS, decode, into_features, into_hidden, layer_one, through_blob
 from ._gpu_field import gather, place, pull
 from ._gpu_points import moved, triple
 
@@ -27,18 +27,22 @@ def into_world(field, hidden, d_out, at, fraction, phase, inside, live, shape: t
 
 @triton.jit
 def both_gradients(field, world, live, colour: tl.constexpr, shape: tl.constexpr):
-    """TSDF and its gradient, luminance and (with ``colour``) its gradient, at world positions."""
+    """TSDF and its gradient, luminance and (if ``colour``, else anything) its gradient, at world positions."""
     at, fraction, phase, inside = place(field, world, shape)
     hidden = layer_one(field, gather(field, at, fraction, live, shape), phase, shape)
-    sdf, red, green, blue = decode(field, hidden)
-    none, one = tl.zeros_like(sdf), tl.zeros_like(sdf) + 1
-    d_sdf = into_world(field, hidden, (one, none, none, none), at, fraction, phase, inside, live, shape)
-    luminance = red * RED + green * GREEN + blue * BLUE
-    d_luminance = (none, none, none)
-    if colour:
-        d_out = (none, red * (1 - red) * RED, green * (1 - green) * GREEN, blue * (1 - blue) * BLUE)
-        d_luminance = into_world(field, hidden, d_out, at, fraction, phase, inside, live, shape)
-    return sdf, d_sdf, luminance, d_luminance
+    out = decode(field, hidden)
+    output = tl.arange(0, OUTPUTS)[None, :]
+    share = tl.where(output == 1, RED, tl.where(output == 2, GREEN, tl.where(output == 3, BLUE, 0.0)))
+    sdf, luminance = tl.sum(tl.where(output == 0, out, 0.0), 1), tl.sum(share * out, 1)
+    one = tl.where(output == 0, 1.0, tl.zeros_like(out))
+    x, y, z = tl.zeros_like(sdf), tl.zeros_like(sdf), tl.zeros_like(sdf)
+    sdf_x, sdf_y, sdf_z = x, y, z
+    # A loop that stays a loop: written out, all its gathers would be merged and their results kept in registers.
+    for k in range(2 if colour else 1):
+        d_out = tl.where(k == 0, one, share * out * (1 - out))
+        x, y, z = into_world(field, hidden, d_out, at, fraction, phase, inside, live, shape)
+        sdf_x, sdf_y, sdf_z = tl.where(k == 0, x, sdf_x), tl.where(k == 0, y, sdf_y), tl.where(k == 0, z, sdf_z)
+    return sdf, (sdf_x, sdf_y, sdf_z), luminance, (x, y, z)
 
 
 @triton.jit

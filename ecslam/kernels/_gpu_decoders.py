@@ -13,6 +13,7 @@ from ._gpu_field import one_blob
 
 WIDE = tl.constexpr(64)
 HALF = tl.constexpr(32)
+OUTPUTS = tl.constexpr(16)  # four, and the least that a matrix product takes
 
 
 @triton.jit
@@ -61,32 +62,40 @@ def layer_one(field, features, phase, shape: tl.constexpr):
 
 
 @triton.jit
-def reader(field, k: tl.constexpr):
-    """Weights [64] from the hidden units to the TSDF (k = 0) or a colour channel (1 to 3)."""
-    unit = tl.arange(0, WIDE)
-    if k == 0:
-        return tl.load(field.w_sdf + unit, unit < HALF, 0.0)
-    return tl.load(field.w_rgb + 3 * (unit - HALF) + k - 1, unit >= HALF, 0.0)
+def readers(field):
+    """Weights [16, 64] from the hidden units to the outputs: row 0 the TSDF, 1 to 3 the colours, the rest zero."""
+    output, unit = tl.arange(0, OUTPUTS)[:, None], tl.arange(0, WIDE)[None, :]
+    to_sdf = tl.load(field.w_sdf + unit + 0 * output, (output == 0) & (unit < HALF), 0.0)
+    to_rgb = tl.load(field.w_rgb + 3 * (unit - HALF) + output - 1, is_colour(output) & (unit >= HALF), 0.0)
+    return to_sdf + to_rgb
+
+
+@triton.jit
+def is_colour(output):
+    """Which outputs are colours."""
+    return (output > 0) & (output < 4)
+
+
+@triton.jit
+def add_readers(into, values):
+    """Add [16, 64] to the gradients of w_sdf and w_rgb."""
+    output, unit = tl.arange(0, OUTPUTS)[:, None], tl.arange(0, WIDE)[None, :]
+    tl.atomic_add(into.w_sdf + unit + 0 * output, values, (output == 0) & (unit < HALF), sem="relaxed")
+    to_rgb = into.w_rgb + 3 * (unit - HALF) + output - 1
+    tl.atomic_add(to_rgb, values, is_colour(output) & (unit >= HALF), sem="relaxed")
 
 
 @triton.jit
 def decode(field, hidden):
-    """TSDF and the three colours, each [P]."""
-    active = tl.maximum(hidden, 0.0)
-    sdf = tl.sum(active * reader(field, 0)[None, :], 1)
-    red = tl.sigmoid(tl.sum(active * reader(field, 1)[None, :], 1))
-    green = tl.sigmoid(tl.sum(active * reader(field, 2)[None, :], 1))
-    blue = tl.sigmoid(tl.sum(active * reader(field, 3)[None, :], 1))
-    return sdf, red, green, blue
+    """The outputs [P, 16]: TSDF, the three colours, nothing."""
+    out = product(tl.maximum(hidden, 0.0), tl.trans(readers(field)))
+    return tl.where(is_colour(tl.arange(0, OUTPUTS)[None, :]), tl.sigmoid(out), out)
 
 
 @triton.jit
 def into_hidden(field, hidden, d_out):
-    """Gradient before the ReLU [P, 64] from those of the four outputs before their sigmoid ([P] each)."""
-    total = d_out[0][:, None] * reader(field, 0)[None, :]
-    for k in tl.static_range(1, 4):
-        total += d_out[k][:, None] * reader(field, k)[None, :]
-    return tl.where(hidden > 0, total, 0.0)
+    """Gradient before the ReLU [P, 64] from that of the outputs before their sigmoid [P, 16]."""
+    return tl.where(hidden > 0, product(d_out, readers(field)), 0.0)
 
 
 @triton.jit

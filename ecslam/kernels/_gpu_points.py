@@ -12,14 +12,16 @@ import triton.language as tl
 from torch import Tensor
 
 from ._gpu_decoders import (
-    HALF,
+    OUTPUTS,
     WIDE,
+    add_readers,
     add_rows,
     blob_rows,
     decode,
     feature_rows,
     into_features,
     into_hidden,
+    is_colour,
     layer_one,
     product,
     through_blob,
@@ -121,9 +123,9 @@ def values_kernel(
         where, there = feature_places(i, live, shape)
         tl.store(features_at + where, tl.join(features[0], features[1]), there)
     out = decode(field, layer_one(field, features, phase, shape))
-    tl.store(sdf + i, out[0], live)
-    for k in tl.static_range(3):
-        tl.store(rgb + 3 * i + k, out[1 + k], live)
+    output = tl.arange(0, OUTPUTS)[None, :]
+    tl.store(sdf + i[:, None] + 0 * output, out, live[:, None] & (output == 0))
+    tl.store(rgb + 3 * i[:, None] + output - 1, out, live[:, None] & is_colour(output))
 
 
 @triton.jit
@@ -141,8 +143,8 @@ def decoders_kernel(
     d_x_rows = tl.zeros([shape.blobs, WIDE], tl.float32)
     d_y_rows = tl.zeros([shape.blobs, WIDE], tl.float32)
     d_z_rows = tl.zeros([shape.blobs, WIDE], tl.float32)
-    d_read_0, d_read_1 = tl.zeros([WIDE], tl.float32), tl.zeros([WIDE], tl.float32)
-    d_read_2, d_read_3 = tl.zeros([WIDE], tl.float32), tl.zeros([WIDE], tl.float32)
+    d_readers = tl.zeros([OUTPUTS, WIDE], tl.float32)
+    output = tl.arange(0, OUTPUTS)[None, :]
     for number in range(tl.program_id(0), blocks, tl.num_programs(0)):
         i = number * block + tl.arange(0, block)
         live = i < points.total
@@ -155,12 +157,8 @@ def decoders_kernel(
         where, there = feature_places(i, live, shape)
         features = tl.split(tl.load(features_at + where, there, 0.0))
         hidden = layer_one(field, features, phase, shape)
-        d_out = (
-            tl.load(d_sdf + i, live, 0.0),
-            tl.load(d_rgb + 3 * i, live, 0.0),
-            tl.load(d_rgb + 3 * i + 1, live, 0.0),
-            tl.load(d_rgb + 3 * i + 2, live, 0.0),
-        )
+        d_out = tl.load(d_sdf + i[:, None] + 0 * output, live[:, None] & (output == 0), 0.0)
+        d_out += tl.load(d_rgb + 3 * i[:, None] + output - 1, live[:, None] & is_colour(output), 0.0)
         d_hidden = into_hidden(field, hidden, d_out)
         d_features = into_features(field, d_hidden, shape)
         tl.store(features_at + where, tl.join(d_features[0], d_features[1]), there)
@@ -168,11 +166,7 @@ def decoders_kernel(
             for axis in tl.static_range(3):
                 tl.store(d_world + 3 * i + axis, through_blob(field, d_hidden, phase, axis, shape), live)
         if want_params:
-            active = tl.maximum(hidden, 0.0)
-            d_read_0 += tl.sum(active * d_out[0][:, None], 0)
-            d_read_1 += tl.sum(active * d_out[1][:, None], 0)
-            d_read_2 += tl.sum(active * d_out[2][:, None], 0)
-            d_read_3 += tl.sum(active * d_out[3][:, None], 0)
+            d_readers += product(tl.trans(d_out), tl.maximum(hidden, 0.0))
             d_even_rows += product(tl.trans(features[0]), d_hidden)
             d_odd_rows += product(tl.trans(features[1]), d_hidden)
             d_x_rows += product(tl.trans(one_blob(phase[0], shape)[0]), d_hidden)
@@ -184,12 +178,7 @@ def decoders_kernel(
         add_rows(into.w_in, blob_rows(0, shape), d_x_rows)
         add_rows(into.w_in, blob_rows(1, shape), d_y_rows)
         add_rows(into.w_in, blob_rows(2, shape), d_z_rows)
-        unit = tl.arange(0, WIDE)
-        tl.atomic_add(into.w_sdf + unit, d_read_0, unit < HALF, sem="relaxed")
-        to_rgb = into.w_rgb + 3 * (unit - HALF)
-        tl.atomic_add(to_rgb, d_read_1, unit >= HALF, sem="relaxed")
-        tl.atomic_add(to_rgb + 1, d_read_2, unit >= HALF, sem="relaxed")
-        tl.atomic_add(to_rgb + 2, d_read_3, unit >= HALF, sem="relaxed")
+        add_readers(into, d_readers)
 
 
 @triton.jit

@@ -28,7 +28,7 @@ from ._gpu_field import Field, Shape
 from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, values_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
 
-BLOCK = 64  # points; one matrix product's rows
+BLOCK = 32  # points; with 64 all but the smallest kernels run out of registers (ptxas for compute capability 9.0)
 RAY_ELEMENTS = 512  # padded samples that one program renders
 PROGRAMS_A_PROCESSOR = 2
 
