@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from ecslam.messages import RunTo
 from ecslam.types import InputError
 
+from . import theme
 from .browser import dismiss_toasts, launch, new_page
 from .server import Dashboard, view
 
 DESKTOP, PHONE = (1440, 860), (390, 780)
 SETTLE_MS = 2500
+_MEANINGS = (theme.ESTIMATE, theme.TRUTH, theme.KEYFRAME, theme.WINDOW, theme.LOOP, theme.BEFORE, theme.OTHER)
+_KEPT_COLORS = ((255, 255, 255), (0, 0, 0), theme.ACCENT, *_MEANINGS, *(theme.paler(color) for color in _MEANINGS))
 
 
 def take(runs: list[Path], out: Path) -> list[Path]:
@@ -48,16 +54,30 @@ def _pictures(
 def _take_one(
     browser: Any, dashboard: Dashboard, size: tuple[int, int], act: Callable[[Any, Dashboard], None], path: Path
 ) -> Path:
-    page = new_page(browser, *size, sharpness=1.5)
+    page = new_page(browser, *size)
     page.goto(dashboard.url)
     page.locator(".ec-row b").wait_for()
+    while dashboard.hub.scene.mesh is None:
+        page.wait_for_timeout(100)
     page.wait_for_timeout(SETTLE_MS)
     act(page, dashboard)
     dismiss_toasts(page)
     page.wait_for_timeout(SETTLE_MS)
-    page.screenshot(path=str(path))
+    path.write_bytes(few_colors(page.screenshot()))
     page.close()
     return path
+
+
+def few_colors(png: bytes) -> bytes:
+    """A screenshot as a PNG of 256 colours, a third of its size: those it has most of, and all that carry meaning."""
+    picture = Image.open(io.BytesIO(png)).convert("RGB")
+    count = 256 - len(_KEPT_COLORS)
+    common = picture.quantize(count, method=Image.Quantize.MEDIANCUT).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*(value for color in _KEPT_COLORS for value in color), *common[: 3 * count]])
+    out = io.BytesIO()
+    picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(out, "png", optimize=True)
+    return out.getvalue()
 
 
 def _show_nothing(page: Any, dashboard: Dashboard) -> None:

@@ -131,7 +131,9 @@ class FakeEngine:
         return self._feed.latest()
 
     def subscribe(self):
-        return self._feed.subscribe()
+        subscription = self._feed.subscribe()
+        self._inbox.put((0, m.RequestMesh(0.04)))
+        return subscription
 
     # ---- the made-up run -----------------------------------------------------------------------------------------
 
@@ -150,8 +152,16 @@ class FakeEngine:
             if self._state in (m.State.INITIALISING, m.State.TRACKING, m.State.MAPPING):
                 self._advance()
 
+    def skip_to(self, frame):
+        """Be paused at ``frame``, however long it takes the test to look."""
+        while self._frame < frame:
+            self._advance()
+        self._state = m.State.PAUSED
+        self.publish()
+        return self
+
     def _advance(self):
-        self._frame += 1
+        self._frame = min(self._frame + 1, self.frames - 1)
         i = self._frame
         if time.monotonic() - self._meshed > MESH_EVERY_S:
             self._show_mesh(0.04)

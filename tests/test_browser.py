@@ -93,7 +93,7 @@ def hue_count(pixels, hue_deg, spread=14):
 
 @pytest.fixture
 def live(tmp_path, browser):
-    engine = FakeEngine(tmp_path / "run", frames=400, period=0.1).start()
+    engine = FakeEngine(tmp_path / "run", frames=400, period=0.25).skip_to(100).start()
     dashboard = server.start(engine, port=0)
     visit = Visit(browser, dashboard)
     yield engine, visit
@@ -104,9 +104,7 @@ def live(tmp_path, browser):
 
 
 def test_scene_shows_mesh_trajectories_and_frusta(live):
-    engine, visit = live
-    engine.submit(m.RunTo(150))
-    visit.wait(lambda: engine.latest().frame >= 150)
+    _, visit = live
     visit.tab("View")
     full = visit.pixels()
     visit.press("Off")
@@ -125,10 +123,12 @@ def test_scene_shows_mesh_trajectories_and_frusta(live):
 
 def test_pause_step_resume_and_hot_keys(live):
     _, visit = live
+    visit.press("Resume")
+    visit.wait(lambda: visit.frame > 103)
     visit.press("Pause")
     visit.state("Paused")
     before = visit.frame
-    visit.page.wait_for_timeout(800)
+    visit.page.wait_for_timeout(1500)
     assert visit.frame == before
     visit.press("Step")
     visit.wait(lambda: visit.frame == before + 1)
@@ -146,7 +146,6 @@ def test_pause_step_resume_and_hot_keys(live):
 
 def test_switch_preset_and_start_over(live):
     engine, visit = live
-    visit.wait(lambda: visit.frame > 20)
     visit.page.get_by_label("Preset", exact=True).first.click()
     visit.page.get_by_role("option", name="full", exact=True).click()
     visit.press("Restart")
@@ -157,8 +156,6 @@ def test_switch_preset_and_start_over(live):
 
 def test_exports_arrive_in_the_browser(live, tmp_path):
     engine, visit = live
-    visit.press("Pause")
-    visit.state("Paused")
     visit.tab("Export")
     visit.download("Export mesh").save_as(tmp_path / "mesh.ply")
     mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
@@ -174,8 +171,6 @@ def test_exports_arrive_in_the_browser(live, tmp_path):
 
 def test_html_replay_plays_by_itself(live, browser, tmp_path):
     _, visit = live
-    visit.press("Pause")
-    visit.state("Paused")
     visit.tab("Export")
     visit.download("Save HTML replay").save_as(tmp_path / "replay.html")
     page, errors = new_page(browser, 600, 400), []
@@ -190,9 +185,6 @@ def test_html_replay_plays_by_itself(live, browser, tmp_path):
 
 def test_click_on_a_keyframe_flies_there(live):
     engine, visit = live
-    visit.wait(lambda: visit.frame > 60)
-    visit.press("Pause")
-    visit.state("Paused")
     visit.tab("Pictures")
     visit.page.wait_for_timeout(800)
     client = next(iter(visit.dashboard.hub.viewers()))
@@ -246,6 +238,7 @@ def test_finished_run_is_scrubbed_and_its_loop_inspected(browser, tmp_path):
 
 def test_page_survives_a_lost_connection(live):
     _, visit = live
+    visit.press("Resume")
     visit.dashboard.hub.server._websock_server.disconnect_all_clients()
     before = visit.frame
     visit.wait(lambda: visit.frame > before + 3)
@@ -253,7 +246,7 @@ def test_page_survives_a_lost_connection(live):
 
 
 def test_usable_on_a_phone(tmp_path, browser):
-    engine = FakeEngine(tmp_path / "run", frames=100, period=0.03).start()
+    engine = FakeEngine(tmp_path / "run", frames=2000, period=0.25).start()
     dashboard = server.start(engine, port=0, dark=True)
     visit = Visit(browser, dashboard, 390, 780)
     try:
