@@ -84,10 +84,15 @@ def grid_points(height: int, width: int, border: int, count: int, rng: np.random
     return (np.minimum(v, h - 1) + border) * width + np.minimum(u, w - 1) + border
 
 
-def choose_pixels(frame: Frame, camera: Intrinsics, count: int, config: Config, rng: np.random.Generator) -> Pixels:
-    """``count`` pixels of a frame. With FUS: its features, the rest from the grid; without: uniform random."""
+def choose_pixels(
+    frame: Frame, camera: Intrinsics, count: int, config: Config, rng: np.random.Generator, *, rim: bool = False
+) -> Pixels:
+    """``count`` pixels of a frame. With FUS: its features, the rest from the grid; without: uniform random.
+
+    rim: whether the grid (or the random choice) reaches into the image's border.
+    """
     height, width = frame.depth.shape
-    border = _border(config, height, width)
+    border = 0 if rim else _border(config, height, width)
     if config.fus:
         corners = feature_points(frame.color, config, count // 2)
         rest = grid_points(height, width, border, count - len(corners), rng)

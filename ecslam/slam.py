@@ -281,7 +281,8 @@ class Slam:
 
     def _make_keyframe(self, frame: Frame) -> Keyframe:
         count = max(64, round(self.config.keyframe_share * frame.depth.size))
-        pixels = choose_pixels(frame, self.intrinsics, count, self.config, self._rng)
+        rim = self.config.mapping.rim
+        pixels = choose_pixels(frame, self.intrinsics, count, self.config, self._rng, rim=rim)
         if not self.config.sampling.without_depth:
             pixels = pixels.take(np.flatnonzero(pixels.depth > 0))
         return Keyframe(frame.index, pixels, make_thumbnail(frame.color))

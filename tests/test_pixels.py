@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecslam.config import Config
-from ecslam.pixels import choose_pixels, feature_points, grid_points
+from ecslam.pixels import choose_pixels, feature_points, grid_points, spread_pixels
 from ecslam.types import Frame, Intrinsics
 
 CAMERA = Intrinsics(500, 510, 319.5, 239.5, 640, 480)
@@ -76,3 +76,21 @@ def test_flat_image_has_no_features_and_still_gives_the_count(frame):
     pixels = choose_pixels(flat, CAMERA, 300, Config(), np.random.default_rng(0))
     assert len(pixels) == 300
     assert not pixels.feature.any()
+
+
+def test_the_rim_is_for_the_map_alone(frame):
+    def reach(pixels):
+        u = pixels.direction[:, 0] * CAMERA.fx + CAMERA.cx
+        return u.min(), 639 - u.max()
+
+    config, rng = Config(border_px=20), np.random.default_rng(0)
+    assert min(reach(choose_pixels(frame, CAMERA, 4000, config, rng))) >= 19.9
+    assert min(reach(spread_pixels(frame, CAMERA, 4000, config, rng))) >= 19.9
+    assert max(reach(choose_pixels(frame, CAMERA, 4000, config, rng, rim=True))) < 10
+
+
+def test_spread_pixels_are_a_grid_without_features(frame):
+    pixels = spread_pixels(frame, CAMERA, 777, Config(), np.random.default_rng(0))
+    assert len(pixels) == 777
+    assert not pixels.feature.any()
+    assert 0 < (pixels.depth == 0).mean() < 0.3

@@ -1,16 +1,20 @@
 """The engine as a whole, on a few small frames of a built-in room."""
 
 import numpy as np
+import pytest
 
+from ecslam import slam
 from ecslam.config import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.slam import Slam
+from ecslam.types import InputError
+
+SMALL = ["mapping.first_iterations=20", "mapping.rays=500", "tracking.rays=300"]
 
 
 def test_restored_engine_goes_on_bit_for_bit():
     room = open_sequence("synthetic/studio?size=160x120&frames=14")
-    settings = ["mapping.first_iterations=20", "mapping.rays=500", "tracking.rays=300"]
-    config = apply_settings(load_preset("lite"), settings)
+    config = apply_settings(load_preset("lite"), SMALL)
     one = Slam(config, room.intrinsics, first_pose=room[0].c2w_gt, bounds=room.bounds)
     for i in range(11):
         one.step(room[i])
@@ -19,3 +23,27 @@ def test_restored_engine_goes_on_bit_for_bit():
         one.step(room[i])
         two.step(room[i])
     assert np.array_equal(one.trajectory.poses(), two.trajectory.poses())
+
+
+@pytest.mark.parametrize("to", ["fused", "none"])
+def test_a_rendered_pose_that_the_volume_contradicts_is_not_taken(monkeypatch, to):
+    room = open_sequence("synthetic/studio?size=160x120&frames=600")
+    config = apply_settings(load_preset("lite"), [*SMALL, f"align.to={to}"])
+    engine = Slam(config, room.intrinsics, first_pose=room[0].c2w_gt, bounds=room.bounds)
+    engine.step(room[0])
+    wrong = np.array(room[1].c2w_gt)
+    wrong[:3, 3] += 0.01
+    monkeypatch.setattr(slam, "track_adam", lambda *_: (wrong, {}))
+    engine.step(room[1])
+    off = np.linalg.norm(engine.trajectory[1][:3, 3] - room[1].c2w_gt[:3, 3])
+    assert off < 0.005 if to == "fused" else off == pytest.approx(0.01 * 3**0.5)
+
+
+def test_something_must_track():
+    room = open_sequence("synthetic/studio?size=160x120&frames=14")
+    config = apply_settings(load_preset("live"), ["align.to=none"])
+    with pytest.raises(InputError, match="nothing tracks"):
+        Slam(config, room.intrinsics)
+    engine = Slam(apply_settings(load_preset("lite"), ["align.to=none"]), room.intrinsics)
+    with pytest.raises(InputError, match="nothing tracks"):
+        engine.configure(load_preset("live"))
