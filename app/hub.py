@@ -247,6 +247,7 @@ class Hub:
             self._acknowledged(message)
             return
         if isinstance(message, MeshReady):
+            self._show()  # a new run clears the scene; its first mesh must not come before that
             self.scene.set_mesh(message)
             self.views.keep_framed()
         elif isinstance(message, Exported):
