@@ -118,7 +118,7 @@ def best_side(mesh: Mesh, up: Array, before: Array | None = None) -> Array:
     sides = np.cos(angles) * first + np.sin(angles) * np.cross(up, first)
     sides = sides if before is None else np.concatenate([before[None], sides])
     area = (normals @ (0.62 * sides + 0.78 * up).T).clip(0).sum(0)
-    return np.asarray(sides[0] if before is not None and area[0] > 0.85 * area.max() else sides[np.argmax(area)])
+    return np.asarray(sides[0] if before is not None and area[0] > 0.75 * area.max() else sides[np.argmax(area)])
 
 
 def behind(c2w: Array, up: Array, distance: float = 1.1) -> tuple[Array, Array]:

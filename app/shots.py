@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from ecslam.messages import RunTo
@@ -19,7 +20,9 @@ from .browser import dismiss_toasts, launch, new_page
 from .server import Dashboard, view
 
 DESKTOP, PHONE = (1440, 860), (390, 780)
-SETTLE_MS = 2500
+SETTLE_MS, MOST_LOOKS = 1500, 30
+COLORS = 160
+STILL = 0.02  # mean change of grey values
 _MEANINGS = (theme.ESTIMATE, theme.TRUTH, theme.KEYFRAME, theme.WINDOW, theme.LOOP, theme.BEFORE, theme.OTHER)
 _KEPT_COLORS = ((255, 255, 255), (0, 0, 0), theme.ACCENT, *_MEANINGS, *(theme.paler(color) for color in _MEANINGS))
 
@@ -62,16 +65,28 @@ def _take_one(
     page.wait_for_timeout(SETTLE_MS)
     act(page, dashboard)
     dismiss_toasts(page)
-    page.wait_for_timeout(SETTLE_MS)
-    path.write_bytes(few_colors(page.screenshot()))
+    path.write_bytes(few_colors(_still(page)))
     page.close()
     return path
 
 
+def _still(page: Any) -> bytes:
+    """A screenshot once the page has come to rest, however slow the machine."""
+    before = np.zeros(0)
+    for _ in range(MOST_LOOKS):
+        page.wait_for_timeout(SETTLE_MS)
+        png = page.screenshot()
+        now = np.asarray(Image.open(io.BytesIO(png)).convert("L"), float)
+        if before.shape == now.shape and np.abs(now - before).mean() < STILL:
+            break
+        before = now
+    return bytes(png)
+
+
 def few_colors(png: bytes) -> bytes:
-    """A screenshot as a PNG of 256 colours, a third of its size: those it has most of, and all that carry meaning."""
+    """A screenshot as a PNG of few colours, a third of its size: those it has most of, and all that carry meaning."""
     picture = Image.open(io.BytesIO(png)).convert("RGB")
-    count = 256 - len(_KEPT_COLORS)
+    count = COLORS - len(_KEPT_COLORS)
     common = picture.quantize(count, method=Image.Quantize.MEDIANCUT).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([*(value for color in _KEPT_COLORS for value in color), *common[: 3 * count]])

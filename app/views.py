@@ -56,11 +56,9 @@ class Views:
         clients = self._server.get_clients()
         self._framed = {k: framing for k, framing in self._framed.items() if k in clients}
         for number, framing in list(self._framed.items()):
-            if time.monotonic() < framing.until:
-                continue
-            client = clients[number]
+            client, settled = clients[number], time.monotonic() >= framing.until
             distance = float(np.linalg.norm(framing.position - framing.look_at))
-            if np.linalg.norm(client.camera.position - framing.position) > MOVED * distance:
+            if settled and np.linalg.norm(client.camera.position - framing.position) > MOVED * distance:
                 del self._framed[number]
                 continue
             position, look_at = self._all(client)
