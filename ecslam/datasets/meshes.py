@@ -1,4 +1,4 @@
-"""Reference surfaces from disk. trimesh is imported only when one is asked for."""
+"""Surfaces from disk and to PLY. trimesh is imported only when one is read."""
 
 from __future__ import annotations
 
@@ -28,6 +28,24 @@ def load_mesh(path: Path) -> Mesh:
         np.asarray(mesh.faces, np.int32),
         np.asarray(mesh.visual.vertex_colors[:, :3], np.uint8) if colored else None,
     )
+
+
+def ply_bytes(mesh: Mesh) -> bytes:
+    """Binary little-endian PLY with vertex colours where the mesh has them."""
+    fields = [("position", "<f4", 3)]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    if mesh.colors is not None:
+        fields.append(("color", "u1", 3))
+        header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    vertices = np.empty(len(mesh.vertices), fields)
+    vertices["position"] = mesh.vertices
+    if mesh.colors is not None:
+        vertices["color"] = mesh.colors
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.faces
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
 
 
 def first_existing(*candidates: Path) -> Path | None:

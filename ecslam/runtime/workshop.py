@@ -10,7 +10,7 @@ from ..types import InputError
 from .control import Control
 from .exports import export_job, render_pictures
 from .feed import Feed
-from .mesh_files import ply_bytes
+from .mesh_files import mesh_bytes
 from .meshjobs import FrozenMap, JobThread, LiveMeshes, build_mesh
 from .run import Run
 
@@ -104,7 +104,7 @@ class Workshop:
 
     def _save(self, run: Run, name: str, frozen: FrozenMap, voxel_m: float, max_triangles: int) -> None:
         mesh = build_mesh(frozen, voxel_m, max_triangles, self._leaving).mesh
-        run.folder.write(name, ply_bytes(mesh))
+        run.folder.write(name, mesh_bytes(mesh, "ply"))
 
     def _complain(self, text: str) -> None:
         self._feed.publish(Notice("error", text))

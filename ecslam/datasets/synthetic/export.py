@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...types import InputError, Mesh, Sequence
+from ...types import InputError, Sequence
+from ..meshes import ply_bytes
 
 DEPTH_SCALE = 6553.5
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -34,7 +35,7 @@ def write_replica(sequence: Sequence, folder: str | Path, progress: Callable[[in
         np.savetxt(folder / "traj.txt", poses.reshape(-1, 16), "%.12f")
         mesh = sequence.reference_mesh()
         if mesh is not None:
-            write_ply(mesh, folder / "mesh.ply")
+            (folder / "mesh.ply").write_bytes(ply_bytes(mesh))
         for i, frame in enumerate(sequence):
             _save(folder / "results" / f"frame{i:06d}.jpg", frame.color[..., ::-1], JPEG)
             depth = np.clip(np.rint(frame.depth.astype(np.float64) * DEPTH_SCALE), 0, 65535)
@@ -44,24 +45,6 @@ def write_replica(sequence: Sequence, folder: str | Path, progress: Callable[[in
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from None
     return folder
-
-
-def write_ply(mesh: Mesh, path: Path) -> None:
-    """Write a mesh as binary PLY with vertex colours where it has them. Raises OSError."""
-    fields = [("position", "<f4", 3)]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
-    header += [f"property float {axis}" for axis in "xyz"]
-    if mesh.colors is not None:
-        fields.append(("color", "u1", 3))
-        header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    vertices = np.empty(len(mesh.vertices), fields)
-    vertices["position"] = mesh.vertices
-    if mesh.colors is not None:
-        vertices["color"] = mesh.colors
-    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, mesh.faces
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
-    path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
 
 
 def _camera(sequence: Sequence) -> str:
