@@ -118,8 +118,8 @@ class MappingConfig:
     rim: bool = True
     lr_grid: float = _number(1e-2, 0.0, 1.0)
     lr_decoder: float = _number(1e-2, 0.0, 1.0)
-    lr_rotation: float = _number(3e-4, 0.0, 1.0)
-    lr_translation: float = _number(3e-4, 0.0, 1.0)
+    lr_rotation: float = _number(1e-4, 0.0, 1.0)
+    lr_translation: float = _number(1e-4, 0.0, 1.0)
     loss: LossWeights = LossWeights()
     smooth_weight: float = _number(1e-6, 0.0)
     smooth_points: int = _number(32, 2, 256)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from .config import Config
 from .field import TsdfField, grow_field, map_params, regrow
+from .field_adam import FieldAdam
 from .kernels import LOSS_NAMES, Backend, FieldParams
 from .losses import smooth_lattice, smoothness
 from .pixels import Pixels
@@ -20,8 +21,6 @@ from .rays import gather, kernel_weights, make_rays
 from .samples import resample_missing
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 
-BETAS = (0.9, 0.99)
-EPSILON = 1e-15
 MIN_BETA = 1.0
 
 
@@ -42,23 +41,12 @@ def _tensors(params: FieldParams) -> list[Tensor]:
 class Mapper:
     """Owns the field and its Adam state; the only writer of both."""
 
-    def __init__(self, field: TsdfField, kernels: Backend, config: Config, seed: int) -> None:
+    def __init__(self, field: TsdfField, kernels: Backend, seed: int) -> None:
         self.field, self.kernels = field, kernels
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator().manual_seed(seed)
         self._gradients = map_params(field.params, torch.zeros_like)
-        self._optimiser = self._make_optimiser(config)
-
-    def _make_optimiser(self, config: Config) -> torch.optim.Adam:
-        tensors = _tensors(self.field.params)
-        for tensor, gradient in zip(tensors, _tensors(self._gradients), strict=True):
-            tensor.grad = gradient
-        m = config.mapping
-        groups = [
-            {"params": tensors[:1], "lr": m.lr_grid},
-            {"params": tensors[1:], "lr": m.lr_decoder},
-        ]
-        return torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True)
+        self._optimiser = FieldAdam(_tensors(field.params))
 
     def run(
         self,
@@ -91,7 +79,9 @@ class Mapper:
             if smooth and m.smooth_weight > 0:
                 _, gradient = smoothness(field, smooth_lattice(field, m, self._generator))
                 self._gradients.table.add_(gradient, alpha=m.smooth_weight)
-            self._optimiser.step()
+            self._optimiser.step(
+                _tensors(self._gradients), (m.lr_grid, *[m.lr_decoder] * (len(FieldParams.__dataclass_fields__) - 1))
+            )
             field.params.beta.clamp_(min=MIN_BETA)
             if result.d_c2w is not None:
                 poses.step(result.d_c2w, 1 - iteration / iterations)
@@ -102,33 +92,27 @@ class Mapper:
 
     def state(self) -> Arrays:
         """The field, the optimiser's moments and the random states, as copies."""
-        moments = {
-            f"moment{i}.{name}": torch.as_tensor(value).cpu().numpy().copy()
-            for i, values in self._optimiser.state_dict()["state"].items()
-            for name, value in values.items()
+        adam = self._optimiser
+        moments = {f"mean{i}": m for i, m in enumerate(adam.mean)} | {
+            f"square{i}": s for i, s in enumerate(adam.square)
         }
         return {
             **prefixed("field", pack_field(self.field)),
             **prefixed("random", pack_random(self._rng, self._generator)),
-            **moments,
+            **prefixed("adam", {k: v.cpu().numpy().copy() for k, v in (moments | {"count": adam.count}).items()}),
         }
 
     @classmethod
-    def restore(cls, state: Arrays, kernels: Backend, config: Config, device: torch.device) -> Mapper:
+    def restore(cls, state: Arrays, kernels: Backend, device: torch.device) -> Mapper:
         """The inverse of ``state``."""
-        self = cls(unpack_field(part("field", state), device), kernels, config, 0)
+        self = cls(unpack_field(part("field", state), device), kernels, 0)
         unpack_random(part("random", state), self._rng, self._generator)
-        moments: dict[int, dict[str, Tensor]] = {}
-        for i in range(len(_tensors(self.field.params))):
-            found = part(f"moment{i}", state)
-            if found:
-                moments[i] = {name: torch.from_numpy(value.copy()) for name, value in found.items()}
-        self._load_moments(moments)
+        found = {k: torch.from_numpy(v.copy()).to(device) for k, v in part("adam", state).items()}
+        adam = self._optimiser
+        adam.mean = [found[f"mean{i}"] for i in range(len(adam.parameters))]
+        adam.square = [found[f"square{i}"] for i in range(len(adam.parameters))]
+        adam.count = found["count"]
         return self
-
-    def _load_moments(self, moments: dict[int, dict[str, Tensor]]) -> None:
-        groups = self._optimiser.state_dict()["param_groups"]
-        self._optimiser.load_state_dict({"state": moments, "param_groups": groups})
 
     def _pick(self, views: Sequence[Pixels], rays: int, newest_share: float) -> list[NDArray[np.int64]]:
         """The newest view gets ``newest_share`` of the rays (an equal share if that is more), the others the rest."""
@@ -137,15 +121,14 @@ class Mapper:
         counts = [older] * (len(views) - 1) + [newest]
         return [self._rng.integers(0, len(view), count) for view, count in zip(views, counts, strict=True)]
 
-    def grow(self, box: NDArray[np.float64], config: Config) -> None:
+    def grow(self, box: NDArray[np.float64]) -> None:
         """Extend the field to the union of its box and ``box`` [2, 3]; values inside and the Adam state are kept."""
-        old, moments = self.field, self._optimiser.state_dict()["state"]
+        old = self.field
         self.field = grow_field(old, box)
         self._gradients = map_params(self.field.params, torch.zeros_like)
-        self._optimiser = self._make_optimiser(config)
-        table = old.params.table.shape
-        carried = {
-            i: {k: regrow(old.layout, self.field.layout, v) if v.shape == table else v for k, v in state.items()}
-            for i, state in moments.items()
-        }
-        self._load_moments(carried)
+        table = self.field.params.table
+
+        def change(moment: Tensor, parameter: Tensor) -> Tensor:
+            return regrow(old.layout, self.field.layout, moment) if parameter is table else moment
+
+        self._optimiser = self._optimiser.moved(_tensors(self.field.params), change)

@@ -122,7 +122,7 @@ class Slam:
         if box is None:
             box = box_of_points(_world(keyframe.pixels, self._first_pose), self.config.field.box_margin_m)
         field = create_field(self.config.field, box, self.config.seed, self.device)
-        self.mapper = Mapper(field, self._kernels, self.config, self.config.seed)
+        self.mapper = Mapper(field, self._kernels, self.config.seed)
         self._frozen = field
         self.trajectory.append(self._first_pose, frame.timestamp, True, keyframe=True)
         self.keyframes.append(keyframe)
@@ -297,7 +297,7 @@ class Slam:
         low, high = self.mapper.field.layout.box.numpy()
         outside = ((points < low) | (points > high)).any(1).mean() if len(points) else 0.0
         if self.config.field.box is None and outside > 0.01:
-            self.mapper.grow(box_of_points(points, self.config.field.box_margin_m), self.config)
+            self.mapper.grow(box_of_points(points, self.config.field.box_margin_m))
 
     def surface_points(self) -> NDArray[np.float32]:
         """Measured points [N, 3] of all keyframes in the world, where the map has been observed."""
@@ -355,7 +355,7 @@ class Slam:
         self = cls(config, intrinsics, device=device, bounds=bounds)
         self.trajectory = Trajectory.restore(part("trajectory", state))
         self.keyframes = unpack_keyframes(part("keyframes", state))
-        self.mapper = Mapper.restore(part("mapper", state), self._kernels, config, self.device)
+        self.mapper = Mapper.restore(part("mapper", state), self._kernels, self.device)
         self._frozen = self._tracking_field()
         unpack_random(part("random", state), self._rng, self._generator)
         self._observed.keys = np.array(state["observed"], np.int64)

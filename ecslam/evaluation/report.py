@@ -13,7 +13,7 @@ from .depth_views import TRIES_PER_VIEW, depth_l1, random_views, up_direction, v
 from .reconstruction import register, surface_error
 from .surface import moved, part, sample_surface, subdivided
 
-LONGEST_EDGE_M = 0.1
+LONGEST_EDGE_M = 0.03
 CULLING_WIDTH = 640
 CLEARANCE_M = 0.1
 REGISTRATION_SAMPLES = 30_000

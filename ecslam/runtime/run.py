@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -144,9 +145,14 @@ class Run:
     def _build(self, first_pose: NDArray[np.float64] | None, state: Arrays | None) -> SlamLike:
         sequence = self.plan.sequence
         bounds = sequence.bounds if first_pose is not None else None
+        running = self.clock.pause()
+        began = monotonic()
         self.slam = self._make(
             self.config, sequence.intrinsics, device=self.plan.device, bounds=bounds, first_pose=first_pose, state=state
         )
+        self.tally.setup_s += monotonic() - began
+        if running:
+            self.clock.resume()
         return self.slam
 
     def _with_errors(self, loop: LoopEvent, after: NDArray[np.float64]) -> LoopEvent:

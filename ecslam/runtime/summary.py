@@ -27,6 +27,7 @@ def summarise(run: Run, export_s: float) -> dict[str, Any]:
         "frames": len(tally.rows),
         "keyframes": len(tally.keyframes),
         "wall_s": round(tally.wall_s, 3),
+        "setup_s": round(tally.setup_s, 3),
         "fps_wall": round(tally.fps_wall, 3),
         "fps_engine": round(tally.fps_engine, 3),
         "ate_rmse_cm": ate.rmse if ate else None,

@@ -21,7 +21,8 @@ class Tally:
     """Counters that survive a checkpoint.
 
     position: frames of the sequence done, skipped ones included. rows: frame index of each pose of the trajectory.
-    unreadable: a sentence for each frame that could not be read. wall_s: seconds spent, pauses left out. engine_ms:
+    unreadable: a sentence for each frame that could not be read. wall_s: seconds spent, pauses left out, and
+    setup_s: seconds that loading the engine's libraries took before, also left out. engine_ms:
     tracking and mapping without the first frame (its initialisation), as Co-SLAM counts.
     """
 
@@ -33,6 +34,7 @@ class Tally:
     lost: int = 0
     loops: int = 0
     wall_s: float = 0.0
+    setup_s: float = 0.0
     engine_ms: float = 0.0
     last_timestamp: float | None = None
 
@@ -84,9 +86,11 @@ class Stopwatch:
         """The time so far."""
         return self._total_s + (monotonic() - self._since if self._since is not None else 0.0)
 
-    def pause(self) -> None:
-        """Stop counting."""
+    def pause(self) -> bool:
+        """Stop counting; whether it was."""
+        was = self._since is not None
         self._total_s, self._since = self.seconds, None
+        return was
 
     def resume(self) -> None:
         """Count again."""
