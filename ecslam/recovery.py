@@ -12,6 +12,11 @@ from .se3 import rotation_angle_deg
 from .tracker import TrackResult
 
 LOST_FIT = 0.25
+LOST_SHARE, FOUND_SHARE = 0.6, 0.85  # of the usual fit: a wrong place still explains up to three quarters
+    0.6,
+    0.85,
+)  # of the usual fit: a wrong place still explains a third to three quarters of a view
+USUAL_OVER = 10
 FOUND_FIT = 0.6
 PATIENCE = 3
 MAX_STEP_M = 0.5
@@ -25,6 +30,7 @@ class Recovery:
     def __init__(self) -> None:
         self.lost, self.missed, self.note = False, False, ""
         self.misses = 0
+        self.usual_fit = 0.0
 
     def judge(
         self, track: TrackResult, last: NDArray[np.float64], relocalise: Callable[[], TrackResult | None]
@@ -34,10 +40,11 @@ class Recovery:
         trusted = not self.lost and self._plausible(track, last)
         if not trusted:
             found = relocalise()
-            if found is not None and found.fit >= FOUND_FIT:
+            if found is not None and found.fit >= max(FOUND_FIT, FOUND_SHARE * self.usual_fit):
                 self.note = "relocalised" if self.lost else "recovered"
                 track, trusted = found, True
         if trusted:
+            self.usual_fit += (track.fit - self.usual_fit) / USUAL_OVER if self.usual_fit else track.fit
             self.lost, self.missed, self.misses = False, False, 0
             return track
         self.misses += 1
@@ -46,9 +53,8 @@ class Recovery:
         self.note = "lost: the map does not explain this frame" if self.lost else "not tracked, pose held"
         return replace(track, c2w=last)
 
-    @staticmethod
-    def _plausible(track: TrackResult, last: NDArray[np.float64]) -> bool:
-        if not np.isfinite(track.c2w).all() or track.fit < LOST_FIT:
+    def _plausible(self, track: TrackResult, last: NDArray[np.float64]) -> bool:
+        if not np.isfinite(track.c2w).all() or track.fit < max(LOST_FIT, LOST_SHARE * self.usual_fit):
             return False
         step = float(np.linalg.norm(track.c2w[:3, 3] - last[:3, 3]))
         return step < MAX_STEP_M and float(rotation_angle_deg(last, track.c2w)) < MAX_TURN_DEG

@@ -1,0 +1,126 @@
+"""Faults of camera and world, in a small built-in room: darkness, a kidnapped camera, NaN, a box too small."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ecslam.config import Config, apply_settings, load_preset
+from ecslam.datasets import open_sequence
+from ecslam.messages import StepReport
+from ecslam.slam import Slam
+from ecslam.types import Frame
+
+ROOM = open_sequence("synthetic/studio?size=160x120")
+QUICK = ["mapping.first_iterations=60", "mapping.rays=800", "keyframe_share=0.2"]
+NOTICED_WITHIN = 5
+FAR = len(ROOM) // 2
+
+
+def live(*settings: str) -> Config:
+    return apply_settings(load_preset("live"), [*QUICK, *settings])
+
+
+def engine(config: Config | None = None) -> Slam:
+    return Slam(config or live(), ROOM.intrinsics, first_pose=ROOM[0].c2w_gt, bounds=ROOM.bounds)
+
+
+def walk(slam: Slam, places: list[int], change=lambda frame: frame) -> list[StepReport]:
+    """Go on along frames of the room's path, whatever their order; each is ``change``d before."""
+    reports = []
+    for place in places:
+        index = len(slam.trajectory)
+        reports.append(slam.step(change(replace(ROOM[place], index=index, timestamp=index / 30))))
+    return reports
+
+
+def error_cm(slam: Slam, place: int) -> float:
+    """How far the newest pose is from the true one of frame ``place``."""
+    return 100 * float(np.linalg.norm(slam.trajectory[-1][:3, 3] - ROOM.poses_gt()[place, :3, 3]))
+
+
+def dark(frame: Frame) -> Frame:
+    return replace(frame, color=np.zeros_like(frame.color))
+
+
+def blind(frame: Frame) -> Frame:
+    return replace(frame, color=np.zeros_like(frame.color), depth=np.zeros_like(frame.depth))
+
+
+@pytest.mark.slow
+def test_lights_off_leaves_the_map_alone_and_on_again_it_goes_on():
+    slam = engine()
+    walk(slam, list(range(12)))
+    before, known = slam.trajectory[-1], len(slam.keyframes)
+    off = walk(slam, [11] * 10, blind)
+    assert not any(r.tracked for r in off)
+    assert [r.lost for r in off].index(True) < NOTICED_WITHIN
+    assert not any(r.is_keyframe for r in off if not r.tracked)
+    assert len(slam.keyframes) == known
+    assert np.allclose(slam.trajectory[-1], before)
+    on = walk(slam, list(range(11, 22)))
+    assert on[0].note == "relocalised"
+    assert all(r.tracked and not r.lost for r in on)
+    assert any(r.is_keyframe for r in on)
+    assert error_cm(slam, 21) < 3
+
+
+@pytest.mark.slow
+def test_darkness_with_depth_is_tracked_by_geometry():
+    slam = engine()
+    walk(slam, list(range(12)))
+    reports = walk(slam, list(range(12, 22)), dark)
+    assert all(r.tracked for r in reports)
+    assert error_cm(slam, 21) < 3
+
+
+@pytest.mark.slow
+def test_a_kidnapped_camera_is_noticed_and_found_again():
+    slam = engine()
+    walk(slam, list(range(16)))
+    known = len(slam.keyframes)
+    away = walk(slam, list(range(FAR, FAR + 8)))
+    assert [r.lost for r in away].index(True) < NOTICED_WITHIN
+    assert not any(r.tracked for r in away)
+    assert len(slam.keyframes) == known
+    back = walk(slam, list(range(10, 22)))
+    assert back[0].note == "relocalised"
+    assert all(r.tracked and not r.lost for r in back)
+    assert error_cm(slam, 21) < 3
+
+
+@pytest.mark.slow
+def test_nan_in_a_tracked_pose_is_not_taken(monkeypatch):
+    slam = engine()
+    walk(slam, list(range(12)))
+    real, calls = Slam._track_from, []
+
+    def track(self, *args):
+        found = real(self, *args)
+        calls.append(1)
+        return replace(found, c2w=np.full((4, 4), np.nan)) if len(calls) == 2 else found
+
+    monkeypatch.setattr(Slam, "_track_from", track)
+    reports = walk(slam, list(range(12, 20)))
+    assert np.isfinite(slam.trajectory.poses()).all()
+    assert reports[1].note == "recovered"
+    assert error_cm(slam, 19) < 3
+
+
+@pytest.mark.slow
+def test_the_box_grows_when_the_camera_leaves_it():
+    """The box of the first frame is all that is known at the start; the camera then turns to the rest of the room."""
+    slam = Slam(live("field.box_margin_m=0.05"), ROOM.intrinsics, first_pose=ROOM[0].c2w_gt)
+    walk(slam, [0])
+    assert slam.field is not None
+    first = slam.field.layout.box.numpy()
+    walk(slam, list(range(1, 61)))
+    grown = slam.field.layout.box.numpy()
+    assert (grown[0] <= first[0]).all()
+    assert (grown[1] >= first[1]).all()
+    assert np.prod(grown[1] - grown[0]) > 1.1 * np.prod(first[1] - first[0])
+    points = slam.surface_points()
+    assert ((points >= grown[0]) & (points <= grown[1])).all(1).mean() > 0.98
+    assert error_cm(slam, 60) < 5
