@@ -13,9 +13,6 @@ from .tracker import TrackResult
 
 LOST_FIT = 0.25
 LOST_SHARE, FOUND_SHARE = 0.6, 0.85  # of the usual fit: a wrong place still explains up to three quarters
-    0.6,
-    0.85,
-)  # of the usual fit: a wrong place still explains a third to three quarters of a view
 USUAL_OVER = 10
 FOUND_FIT = 0.6
 PATIENCE = 3
