@@ -27,11 +27,12 @@ MIN_BETA = 1.0
 @dataclass(frozen=True)
 class MapResult:
     """c2w: float64 [W, 4, 4] refined poses of the views. losses: weighted terms of the last iteration; loss_first: the
-    objective of the first one."""
+    objective of the first one. failed: NaN or infinity came up, so map and poses are as they were before."""
 
     c2w: NDArray[np.float64]
     losses: dict[str, float]
     loss_first: float
+    failed: bool = False
 
 
 def _tensors(params: FieldParams) -> list[Tensor]:
@@ -67,6 +68,7 @@ class Mapper:
         poses.fix(torch.from_numpy(np.flatnonzero(fixed)).to(device))
         weights, move = kernel_weights(m.loss, config), not fixed.all()
         first = last = torch.zeros(len(LOSS_NAMES), device=device)
+        before = [t.clone() for t in self._learnt()]
         for iteration in range(iterations):
             if interrupt is not None:
                 interrupt()
@@ -87,8 +89,16 @@ class Mapper:
                 poses.step(result.d_c2w, 1 - iteration / iterations)
             last = result.losses
             first = last if iteration == 0 else first
+        if not all(bool(torch.isfinite(t).all()) for t in (*self._learnt(), poses.c2w)):
+            for tensor, kept in zip(self._learnt(), before, strict=True):
+                tensor.copy_(kept)
+            return MapResult(c2w, {}, float("nan"), failed=True)
         losses = dict(zip(LOSS_NAMES, last.tolist(), strict=True))
         return MapResult(poses.c2w.cpu().numpy(), losses, float(first.sum()))
+
+    def _learnt(self) -> list[Tensor]:
+        adam = self._optimiser
+        return [*_tensors(self.field.params), *adam.mean, *adam.square, adam.count]
 
     def state(self) -> Arrays:
         """The field, the optimiser's moments and the random states, as copies."""

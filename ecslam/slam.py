@@ -27,7 +27,7 @@ from .observed import ObservedVoxels
 from .pixels import Pixels, choose_pixels, spread_pixels
 from .recovery import Recovery, best_start
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
-from .se3 import rotation_angle_deg
+from .se3 import retract, rotation_angle_deg
 from .tracker import TrackResult, fit, track_adam, track_direct
 from .trajectory import Trajectory
 from .types import Frame, FrameError, InputError, Intrinsics
@@ -39,6 +39,8 @@ Interrupt = Callable[[], None]
 LEAST_POINTS = 64
 WORSE = 1.05  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
 RELOCALISE_FROM = 5
+GAP_S = 1.0
+AROUND_M, AROUND_RAD = 0.1, 0.1
 RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
 
 
@@ -77,6 +79,7 @@ class Slam:
         self._pending: Future[MapResult] | None = None
         self._window: NDArray[np.int64] = np.empty(0, np.int64)
         self._frozen: TsdfField | None = None
+        self._note = ""
 
     # ---- one frame --------------------------------------------------------------------------------------------------
 
@@ -88,7 +91,7 @@ class Slam:
         self._apply_pending(block=False)
         track = self._track(frame)
         index, lost = len(self.trajectory), self._recovery.lost
-        keyframe = index % self.config.keyframe_every == 0 and not lost
+        keyframe = index % self.config.keyframe_every == 0 and not self._recovery.missed
         self.trajectory.append(track.c2w, frame.timestamp, not self._recovery.missed, keyframe)
         if not self._recovery.missed:
             self._fuse(frame)
@@ -110,7 +113,7 @@ class Slam:
             track_ms=1e3 * (tracked - started),
             map_ms=1e3 * (time.perf_counter() - tracked),
             loop=loop,
-            note=self._recovery.note,
+            note=self._recovery.note or self._take_note(),
         )
 
     def _first_frame(self, frame: Frame, interrupt: Interrupt | None) -> StepReport:
@@ -162,10 +165,14 @@ class Slam:
 
     def _track(self, frame: Frame) -> TrackResult:
         """Constant-velocity start, the preset's tracker, and recovery when the map does not explain the frame."""
-        guess = self.trajectory.predict() if not self._recovery.lost else self.trajectory[-1]
+        gap = frame.timestamp - self.trajectory.timestamps[-1] > GAP_S
+        guess = self.trajectory[-1] if self._recovery.lost or gap else self.trajectory.predict()
         measured = spread_pixels(frame, self.intrinsics, self.config.align.points, self.config, self._rng)
         usable = len(measured.points()) >= LEAST_POINTS
-        track = self._track_from(frame, measured, guess) if usable else TrackResult(guess, {}, 0.0)
+        track = TrackResult(guess, {}, 0.0)
+        if usable:
+            starts = _around(guess) if gap else [guess]
+            track = best_start(lambda start: self._track_from(frame, measured, start), starts)
         return self._recovery.judge(
             track, self.trajectory[-1], lambda: self._relocalise(frame, measured) if usable else None
         )
@@ -261,11 +268,17 @@ class Slam:
             return select_window(poses, poses[-1], rays, self.config.window)
         return random_window(len(poses), rays, self.config.window, self._rng)
 
+    def _take_note(self) -> str:
+        note, self._note = self._note, ""
+        return note
+
     def _apply(self, result: MapResult) -> None:
+        if result.failed:
+            self._note = "the mapping diverged and was undone"
+            return
         trained = max(len(self.keyframes) - 2, 0)  # its surface has been through two mappings by now
         self._observed.add(_world(self.keyframes[trained].pixels, self.trajectory.keyframe_poses()[trained]))
-        if np.isfinite(result.c2w).all():
-            self.trajectory.move_keyframes(self._window, result.c2w)
+        self.trajectory.move_keyframes(self._window, result.c2w)
         self._frozen = self._tracking_field()
 
     def _apply_pending(self, block: bool) -> None:
@@ -343,7 +356,7 @@ class Slam:
             "observed": self._observed.keys,
             **prefixed("volume", self._volume.state() if self._volume is not None else {}),
             "inside_loop": np.array(self._loops.inside),
-            "lost": np.array([self._recovery.lost, self._recovery.misses]),
+            "lost": np.array([self._recovery.lost, self._recovery.misses, self._recovery.usual_fit]),
         }
 
     @classmethod
@@ -362,12 +375,20 @@ class Slam:
         if self._volume is not None:
             self._volume.load(part("volume", state))
         self._loops.inside = bool(state["inside_loop"])
-        self._recovery.lost, self._recovery.misses = bool(state["lost"][0]), int(state["lost"][1])
+        recovery, (lost, misses, usual_fit) = self._recovery, state["lost"]
+        recovery.lost, recovery.misses, recovery.usual_fit = bool(lost), int(misses), float(usual_fit)
         return self
 
     def _require_field(self) -> TsdfField:
         assert self._frozen is not None
         return self._frozen
+
+
+def _around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The pose [4, 4] and those a step or a turn away along each axis: where to look for a camera after a gap."""
+    steps = np.concatenate([np.zeros((1, 6)), np.diag([AROUND_M] * 3 + [AROUND_RAD] * 3)])
+    moves = torch.from_numpy(np.concatenate([steps, -steps[1:]]))
+    return list(retract(torch.from_numpy(c2w).expand(len(moves), 4, 4), moves).numpy())
 
 
 def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -23,8 +23,8 @@ from ecslam.runtime.tally import Tally
 from ecslam.types import InputError
 
 SUMMARY_KEYS = """
-    sequence preset device kernels seed frames keyframes wall_s setup_s fps_wall fps_engine ate_rmse_cm ate_mean_cm ate_max_cm
-    parameters parameters_mb peak_memory_mb skipped_frames lost_frames loop_closures
+    sequence preset device kernels seed frames keyframes wall_s setup_s fps_wall fps_engine
+    ate_rmse_cm ate_mean_cm ate_max_cm parameters parameters_mb peak_memory_mb skipped_frames lost_frames loop_closures
     kernels_note unreadable_frames export_s not_saved
 """
 

@@ -124,3 +124,36 @@ def test_the_box_grows_when_the_camera_leaves_it():
     points = slam.surface_points()
     assert ((points >= grown[0]) & (points <= grown[1])).all(1).mean() > 0.98
     assert error_cm(slam, 60) < 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("broken", ["table", "w_sdf"])
+def test_nan_in_the_map_is_rolled_back(broken, monkeypatch):
+    slam = engine()
+    walk(slam, list(range(7)))
+    assert slam.mapper is not None
+    real, calls = slam.mapper.kernels.step, []
+
+    def step(layout, params, c2w, rays, weights, into, want_poses):
+        result = real(layout, params, c2w, rays, weights, into, want_poses)
+        calls.append(1)
+        if len(calls) == 3:
+            getattr(into, broken).view(-1)[0] = float("nan")
+        return result
+
+    monkeypatch.setattr(slam.mapper.kernels, "step", step)
+    reports = walk(slam, list(range(7, 16)))
+    assert len(calls) > 3
+    assert all(np.isfinite(value).all() for value in slam.state().values() if value.dtype.kind == "f")
+    assert sum("undone" in r.note for r in reports) == 1
+    assert all(r.tracked for r in reports)
+    assert error_cm(slam, 15) < 3
+
+
+@pytest.mark.slow
+def test_after_a_gap_of_over_a_second_the_search_is_wider():
+    slam = engine()
+    walk(slam, list(range(20)))
+    report = slam.step(replace(ROOM[23], index=20, timestamp=19 / 30 + 1.2))
+    assert report.tracked
+    assert error_cm(slam, 23) < 3
