@@ -255,14 +255,14 @@ def test_usable_on_a_phone(tmp_path, browser):
     dashboard = server.start(engine, port=0, dark=True)
     visit = Visit(browser, dashboard, 390, 780)
     try:
+        visit.press("Pause")
+        visit.state("Paused")
         wide = visit.page.evaluate("document.documentElement.scrollWidth")
         card = visit.page.locator(".ec").first.bounding_box()
         assert wide <= 390
         assert card["x"] >= 0
         assert card["x"] + card["width"] <= 390
         assert card["width"] > 340
-        visit.press("Pause")
-        visit.state("Paused")
     finally:
         visit.page.close()
         dashboard.close()
