@@ -10,7 +10,9 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ecslam.messages import (
     Ack,
@@ -154,7 +156,6 @@ class ReplayEngine:
             replace(k, c2w=trajectory[at]) for k, at in zip(run.keyframes, self._past.keyframes, strict=True) if at <= i
         )
         mapped = next((r for r in run.rows[i::-1] if r.get("window")), row)
-        thumbnail = keyframes[-1].thumbnail if keyframes and keyframes[-1].thumbnail.any() else None
         return Snapshot(
             state=state,
             sequence=self.sequences[0],
@@ -165,7 +166,7 @@ class ReplayEngine:
             trajectory_gt=run.trajectory_gt,
             keyframes=keyframes,
             window=tuple(mapped.get("window") or ()),
-            color=thumbnail,
+            color=_decoded(keyframes[-1].thumbnail) if keyframes else None,
             fov_y_rad=run.fov_y_rad,
             aspect=run.aspect,
             losses=dict(row.get("losses") or {}),
@@ -219,3 +220,9 @@ def export(run: Run, command: Export) -> Path:
                     archive.write(file, file.relative_to(run.folder))
         return path
     raise InputError(f"{run.folder}: this run holds no {command.kind} to export")
+
+
+def _decoded(jpeg: bytes) -> NDArray[np.uint8] | None:
+    """The picture [h, w, 3] in a JPEG file; None where there is none."""
+    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
+    return None if picture is None else np.ascontiguousarray(picture[:, :, ::-1], np.uint8)

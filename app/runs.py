@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import trimesh
 import viser.transforms as vt
@@ -23,7 +22,6 @@ from .geometry import wxyz
 from .glb import simplify
 
 Array = NDArray[np.float64]
-_NO_PICTURE = np.zeros((3, 4, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -154,12 +152,11 @@ def _keyframes(folder: Path, rows: tuple[dict[str, Any], ...], trajectory: Array
     return tuple(out)
 
 
-def _picture(folder: Path, name: Any) -> NDArray[np.uint8]:
+def _picture(folder: Path, name: Any) -> bytes:
     path = folder / str(name or "")
     if not name or not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
-        return _NO_PICTURE
-    picture = cv2.imread(str(path))
-    return _NO_PICTURE if picture is None else np.ascontiguousarray(picture[:, :, ::-1], np.uint8)
+        return b""
+    return path.read_bytes()
 
 
 def _loop_event(row: dict[str, Any]) -> LoopEvent:

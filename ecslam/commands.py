@@ -9,23 +9,22 @@ import webbrowser
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from . import datasets
 from .config import Config
-from .evaluation.trajectory import absolute_error, relative_error
 from .evaluation.trajectory_io import read_tum
 from .messages import Snapshot
 from .runtime.checkpoint import load_checkpoint
 from .runtime.driven import import_slam
 from .runtime.engine import Engine
 from .runtime.files import to_json, write_atomic
+from .runtime.judge import judge_run, read_mesh, read_truth
 from .runtime.mesh_files import mesh_bytes
-from .runtime.meshjobs import FrozenMap, build_mesh
+from .runtime.meshjobs import MESH_POINTS, FrozenMap, build_mesh
 from .runtime.signals import quit_on_signals
-from .types import InputError, Mesh, Sequence
+from .types import InputError, Sequence
 
 console = Console()
 BUILT_IN = ("synthetic/studio", "synthetic/apartment", "synthetic/corridor")
@@ -171,64 +170,16 @@ def draw_picture(folder: Path) -> Path | None:
     return folder / "picture.png"
 
 
-def read_truth(folder: Path, times: Any) -> Any:
-    """Ground-truth poses [N, 4, 4] at ``times``, NaN where there is none; None without ground truth."""
-    path = folder / "groundtruth.txt"
-    if not path.is_file():
-        return None
-    found_times, found = read_tum(path)
-    truth = np.full((len(times), 4, 4), np.nan)
-    at = np.searchsorted(times, found_times).clip(0, len(times) - 1)
-    truth[at] = found
-    return truth
-
-
-def read_mesh(path: Path) -> Mesh:
-    """A mesh file of ours. Raises InputError."""
-    from .datasets.meshes import load_mesh
-
-    if not path.is_file():
-        raise InputError(f"{path}: no mesh here; make it with: ecslam mesh {path.parent}")
-    return load_mesh(path)
-
-
 def evaluate(folder: Path) -> None:
     """Fill ``summary.json`` with the figures that need ground truth, and print them."""
-    from .evaluation.report import evaluate_run
-
-    summary_path, about_path = folder / "summary.json", folder / "run.json"
-    if not summary_path.is_file() or not about_path.is_file():
-        raise InputError(f"{folder}: no finished run here; give the folder that `ecslam run --out` wrote")
-    summary, about = json.loads(summary_path.read_text()), json.loads(about_path.read_text())
-    times, poses = read_tum(folder / "trajectory.txt")
-    truth = read_truth(folder, times)
-    if truth is None:
-        raise InputError(f"{folder}: the sequence has no ground truth, so there is nothing to compare with")
-    sequence = datasets.select_frames(open_sequence(about["sequence"]), about["frames"])
-    ate, rpe = absolute_error(poses, truth), relative_error(poses, truth)
-    if ate is not None:
-        summary |= {"ate_rmse_cm": ate.cm.rmse, "ate_mean_cm": ate.cm.mean, "ate_max_cm": ate.cm.max}
-        summary["ate_median_cm"] = ate.cm.median
-    if rpe is not None:
-        summary |= {"rpe_cm": rpe.cm.rmse, "rpe_deg": rpe.deg.rmse}
-    reference = sequence.reference_mesh()
-    if reference is None:
-        console.print("no reference mesh in this sequence: the trajectory's figures only")
-    else:
-        with _progress() as bar:
-            task = bar.add_task("comparing meshes", total=1.0)
-            figures = evaluate_run(
-                read_mesh(folder / "mesh.ply"),
-                reference,
-                sequence.intrinsics,
-                truth,
-                progress=lambda done: bar.update(task, completed=done),
-            )
-        summary |= figures
-    write_atomic(summary_path, json.dumps(summary, indent=2).encode())
-    for name, value in summary.items():
-        if name.startswith(("ate_", "rpe_", "depth_l1", "accuracy", "completion")) and value is not None:
-            console.print(f"  {name:18} {value:.3f}")
+    with _progress() as bar:
+        task = bar.add_task("comparing with the ground truth", total=1.0)
+        figures = judge_run(folder, lambda done: bar.update(task, completed=done))
+        bar.update(task, completed=1.0)
+    for name, value in figures.items():
+        console.print(f"  {name:18} {value:.3f}")
+    if "depth_l1_cm" not in figures:
+        console.print("no reference mesh in this sequence, or nothing of it in the map: the trajectory's figures only")
 
 
 def remesh(folder: Path, voxel_m: float, out: Path) -> None:
@@ -247,7 +198,7 @@ def remesh(folder: Path, voxel_m: float, out: Path) -> None:
     slam = Slam.restore(config, camera, checkpoint.arrays)
     sdf, color = slam.query()
     with console.status("meshing"):
-        made = build_mesh(FrozenMap(len(slam.trajectory) - 1, sdf, color, slam.surface_points()), voxel_m)
+        made = build_mesh(FrozenMap(len(slam.trajectory) - 1, sdf, color, slam.surface_points(MESH_POINTS)), voxel_m)
     write_atomic(out, mesh_bytes(made.mesh, out.suffix[1:]))
     console.print(f"{out}: {len(made.mesh.vertices)} vertices, {len(made.mesh.faces)} triangles", soft_wrap=True)
 

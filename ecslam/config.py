@@ -107,12 +107,14 @@ class MappingConfig:
     """Joint optimisation of the map and the poses in the window.
 
     newest_share: of the rays, for the newest keyframe. rim: whether the stored pixels reach into the border of
-    ``border_px`` (ours; without them what is only ever seen there stays unmapped).
+    ``border_px`` (ours; without them what is only ever seen there stays unmapped). final_iterations: of the map alone,
+    on all keyframes, after the last frame (ours).
     """
 
     every: int = _number(5, 1, 1000)
     first_iterations: int = _number(200, 1, 100_000)
     iterations: int = _number(10, 0, 10_000)
+    final_iterations: int = _number(100, 0, 100_000)
     rays: int = _number(2000, 16, 1_000_000)
     newest_share: float = _number(0.2, 0.0, 1.0)
     rim: bool = True

@@ -58,10 +58,12 @@ class Mapper:
         config: Config,
         interrupt: Callable[[], None] | None = None,
         smooth: bool = False,
+        settle: bool = False,
     ) -> MapResult:
         """Optimise the map and the poses c2w [W, 4, 4] of the views where not ``fixed`` [W].
 
-        Every iteration draws its rays from the stored pixels and transforms them by the current poses.
+        Every iteration draws its rays from the stored pixels and transforms them by the current poses. smooth: with the
+        smoothness term. settle: the map's learning rates fade to none, as those of the poses always do.
         """
         m, field, device = config.mapping, self.field, self.field.device
         poses = PoseAdam(torch.from_numpy(c2w).to(device), m.lr_rotation, m.lr_translation)
@@ -81,12 +83,13 @@ class Mapper:
             if smooth and m.smooth_weight > 0:
                 _, gradient = smoothness(field, smooth_lattice(field, m, self._generator))
                 self._gradients.table.add_(gradient, alpha=m.smooth_weight)
-            self._optimiser.step(
-                _tensors(self._gradients), (m.lr_grid, *[m.lr_decoder] * (len(FieldParams.__dataclass_fields__) - 1))
-            )
+            left = 1 - iteration / iterations
+            decoders = [m.lr_decoder] * (len(FieldParams.__dataclass_fields__) - 1)
+            rates = [(left if settle else 1.0) * rate for rate in (m.lr_grid, *decoders)]
+            self._optimiser.step(_tensors(self._gradients), rates)
             field.params.beta.clamp_(min=MIN_BETA)
             if result.d_c2w is not None:
-                poses.step(result.d_c2w, 1 - iteration / iterations)
+                poses.step(result.d_c2w, left)
             last = result.losses
             first = last if iteration == 0 else first
         if not all(bool(torch.isfinite(t).all()) for t in (*self._learnt(), poses.c2w)):

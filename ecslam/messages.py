@@ -80,11 +80,12 @@ class StepReport:
 
 @dataclass(frozen=True)
 class KeyframeView:
-    """A keyframe as the world sees it. c2w: float64 [4, 4]; thumbnail: uint8 [h, w, 3] RGB, at most 160 px wide."""
+    """A keyframe as the world sees it. c2w: float64 [4, 4]; thumbnail: a JPEG at most 160 px wide, empty where there
+    is none."""
 
     frame: int
     c2w: NDArray[np.float64]
-    thumbnail: NDArray[np.uint8]
+    thumbnail: bytes
 
 
 @dataclass(frozen=True)

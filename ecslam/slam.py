@@ -37,11 +37,12 @@ from .window import random_window, select_window
 
 Interrupt = Callable[[], None]
 LEAST_POINTS = 64
-WORSE = 1.05  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
+WORSE = 1.02  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
 RELOCALISE_FROM = 5
 GAP_S = 1.0
 AROUND_M, AROUND_RAD = 0.1, 0.1
 RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
+SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
 
 
 class Slam:
@@ -151,15 +152,27 @@ class Slam:
             map_ms=1e3 * (time.perf_counter() - started),
         )
 
-    def finish(self) -> None:
-        """The last mapping, with the smoothness term (paper: "at the last image frame"); call it once, at the end."""
+    def finish(self, interrupt: Interrupt | None = None) -> None:
+        """The last mapping, with the smoothness term (paper: "at the last image frame"), then the map alone on all
+        keyframes (ours); call it once, at the end. Raises whatever ``interrupt`` raises; no pose has moved then, or
+        all have come to rest."""
         self._apply_pending(block=True)
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
         if self.mapper is not None and not self._recovery.lost:
             self._window = self._choose_window()
-            self._apply(self._optimise(self._window, self.config.mapping.iterations, None, smooth=True))
+            self._apply(self._optimise(self._window, self.config.mapping.iterations, interrupt, smooth=True))
+            self._settle(interrupt)
+
+    def _settle(self, interrupt: Interrupt | None) -> None:
+        """Every part of the map gets its last iterations at a falling rate, not only what the last windows saw."""
+        assert self.mapper is not None
+        mapping = replace(self.config.mapping, newest_share=0.0)
+        rows = _spread(len(self.keyframes), mapping.rays // SETTLE_RAYS)
+        views, poses = [self.keyframes[i].pixels for i in rows], self.trajectory.keyframe_poses()[rows]
+        fixed, config = np.ones(len(rows), bool), replace(self.config, mapping=mapping)
+        self.mapper.run(views, poses, fixed, mapping.final_iterations, config, interrupt, settle=True)
 
     # ---- tracking ---------------------------------------------------------------------------------------------------
 
@@ -312,10 +325,13 @@ class Slam:
         if self.config.field.box is None and outside > 0.01:
             self.mapper.grow(box_of_points(points, self.config.field.box_margin_m))
 
-    def surface_points(self) -> NDArray[np.float32]:
-        """Measured points [N, 3] of all keyframes in the world, where the map has been observed."""
+    def surface_points(self, limit: int) -> NDArray[np.float32]:
+        """Measured points [N, 3] of all keyframes in the world, where the map has been observed: about ``limit`` of
+        them where there are more."""
         poses = self.trajectory.keyframe_poses()
-        parts = [_world(k.pixels, pose) for k, pose in zip(self.keyframes, poses, strict=True)]
+        stride = max(1, -(-sum(len(k.pixels) for k in self.keyframes) // limit))
+        thinned = [k.pixels.take(np.arange(0, len(k.pixels), stride)) for k in self.keyframes]
+        parts = [_world(pixels, pose) for pixels, pose in zip(thinned, poses, strict=True)]
         return np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
 
     @property
@@ -389,6 +405,11 @@ def _around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     steps = np.concatenate([np.zeros((1, 6)), np.diag([AROUND_M] * 3 + [AROUND_RAD] * 3)])
     moves = torch.from_numpy(np.concatenate([steps, -steps[1:]]))
     return list(retract(torch.from_numpy(c2w).expand(len(moves), 4, 4), moves).numpy())
+
+
+def _spread(count: int, limit: int) -> NDArray[np.int64]:
+    """At most ``limit`` of ``count`` indices, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
 
 
 def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ecslam import messages as m
 from ecslam.runtime.feed import Feed
+from ecslam.runtime.pictures import jpeg
 from ecslam.types import InputError, Mesh
 
 FOV, ASPECT = 0.9, 4 / 3
@@ -94,6 +95,11 @@ def picture(frame: int, tint: float = 0.0) -> np.ndarray:
     green = 130 + 60 * np.cos(7 * y - frame / 21)
     blue = 120 + 80 * np.sin(4 * (x + y) + frame / 9)
     return np.clip(np.stack([red, green, blue], -1) + tint, 0, 255).astype(np.uint8)
+
+
+@lru_cache(2000)
+def thumbnail(frame: int) -> bytes:
+    return jpeg(picture(frame)[::2, ::2])
 
 
 class FakeEngine:
@@ -197,7 +203,7 @@ class FakeEngine:
     def snapshot(self) -> m.Snapshot:
         i = max(self._frame, 0)
         poses = self._estimate(i)
-        keys = tuple(m.KeyframeView(k, poses[k], picture(k)[::2, ::2]) for k in range(0, i + 1, 5))
+        keys = tuple(m.KeyframeView(k, poses[k], thumbnail(k)) for k in range(0, i + 1, 5))
         old = (0, 5, 10, 15, 20) if self._loops and i - self._loops[-1].frame < 20 else ()
         window = (*old, *(k.frame for k in keys[-5:] if k.frame not in old))
         error = 100 * np.linalg.norm(poses[:, :3, 3] - self._gt[: i + 1, :3, 3], axis=1)

@@ -83,6 +83,7 @@ class Behaviour:
 
     first_interrupts: int = 0
     interrupts: int = 1
+    final_interrupts: int = 0
     pause_s: float = 0.0
     loop_at: int = -1
     lost: tuple[int, ...] = ()
@@ -137,10 +138,13 @@ class FakeSlam:
             loop=loop,
         )
 
-    def finish(self) -> None:
+    def finish(self, interrupt=None) -> None:
+        for _ in range(self.behaviour.final_interrupts):
+            time.sleep(self.behaviour.pause_s)
+            interrupt()
         self.finished = True
 
-    def surface_points(self) -> np.ndarray:
+    def surface_points(self, limit) -> np.ndarray:
         directions = np.random.default_rng(0).normal(size=(4000, 3))
         return (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
 

@@ -37,6 +37,7 @@ from ecslam.messages import (
     Stop,
     Tune,
 )
+from ecslam.runtime.checkpoint import load_checkpoint
 from ecslam.runtime.protocol import EngineHandle
 
 LONG = Behaviour(first_interrupts=100_000, pause_s=0.001)
@@ -99,6 +100,25 @@ def test_leaving_abandons_a_long_mapping_within_two_seconds(tmp_path, command):
         assert not made[0].finished
     first = json.loads((tmp_path / "r/summary.json").read_text())
     assert first["frames"] == 0
+
+
+@pytest.mark.parametrize("command", [Quit(), Restart()])
+def test_leaving_abandons_the_last_mapping_which_can_be_made_up_for(tmp_path, command):
+    behaviour = Behaviour(final_interrupts=100_000, pause_s=0.001)
+    with running(tmp_path / "r", FakeSequence(3), behaviour) as (engine, watch, made):
+        watch.until(lambda m: isinstance(m, Snapshot) and m.frame == 2)
+        time.sleep(0.2)
+        behaviour.final_interrupts = 0
+        started = time.monotonic()
+        watch.ask(command)
+        if isinstance(command, Quit):
+            assert engine.join(3)
+        else:
+            watch.state(State.FINISHED)
+        assert time.monotonic() - started < 5
+        assert not made[0].finished
+    assert json.loads((tmp_path / "r/summary.json").read_text())["frames"] == 3
+    assert not load_checkpoint(tmp_path / "r/checkpoints").meta["finished"]
 
 
 def test_a_mesh_comes_within_five_seconds_even_during_the_first_mapping(tmp_path):

@@ -121,7 +121,7 @@ def test_the_box_grows_when_the_camera_leaves_it():
     assert (grown[0] <= first[0]).all()
     assert (grown[1] >= first[1]).all()
     assert np.prod(grown[1] - grown[0]) > 1.1 * np.prod(first[1] - first[0])
-    points = slam.surface_points()
+    points = slam.surface_points(100_000)
     assert ((points >= grown[0]) & (points <= grown[1])).all(1).mean() > 0.98
     assert error_cm(slam, 60) < 5
 

@@ -56,7 +56,7 @@ class Panel(BasePanel):
 
     def keyframe(self, keyframe: KeyframeView) -> None:
         self._keyframe = True
-        figure = _figure(keyframe.thumbnail, "colour")
+        figure = _image(keyframe.thumbnail, "colour") if keyframe.thumbnail else ""
         self._html.content = (
             f'<div class="ec"><b>Keyframe {keyframe.frame + 1}</b><div class="ec-six">{figure}</div></div>'
         )
@@ -69,8 +69,12 @@ class Panel(BasePanel):
 
 
 def _figure(picture: NDArray[np.uint8], name: str) -> str:
-    ok, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-    text = base64.b64encode(data.tobytes()).decode() if ok else ""
+    _, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
+    return _image(data.tobytes(), name)
+
+
+def _image(jpeg: bytes, name: str) -> str:
+    text = base64.b64encode(jpeg).decode()
     return f'<figure><img src="data:image/jpeg;base64,{text}" alt="{name}"><figcaption>{name}</figcaption></figure>'
 
 

@@ -235,7 +235,7 @@ class Control:
     def wait_for(self, done: Callable[[], bool]) -> bool:
         """Wait until ``done`` answers True; False when a restart or the end of the engine comes first. See ``wake``."""
         with self._changed:
-            self._changed.wait_for(lambda: done() or self.quitting or self._restart is not None)
+            self._changed.wait_for(lambda: done() or self.leaving)
             return done()
 
     def wake(self) -> None:
@@ -268,6 +268,11 @@ class Control:
             taken = [item for item in self._work if not kinds or isinstance(item[1], kinds)]
             self._work = deque(item for item in self._work if item not in taken)
             return taken
+
+    @property
+    def leaving(self) -> bool:
+        """Whether the run's last mapping is to be left out: a restart or the end of the engine waits for it."""
+        return self.quitting or self._restart is not None
 
     @property
     def leave_now(self) -> bool:

@@ -16,7 +16,7 @@ State = dict[str, NDArray[Any]]
 
 
 class Abandoned(Exception):
-    """Raised by the ``interrupt`` that ``SlamLike.step`` is given, through ``step``, to leave a frame unfinished."""
+    """Raised by the ``interrupt`` that ``SlamLike`` is given, through its ``step`` or ``finish``, to leave early."""
 
 
 class TrajectoryLike(Protocol):
@@ -58,12 +58,12 @@ class SlamLike(Protocol):
         """Process a frame; ``interrupt`` is called inside long loops and may raise to abandon it."""
         ...
 
-    def finish(self) -> None:
-        """The last mapping."""
+    def finish(self, interrupt: Callable[[], None] | None = None) -> None:
+        """The last mapping; ``interrupt`` as in ``step``."""
         ...
 
-    def surface_points(self) -> NDArray[np.float32]:
-        """Measured points [N, 3] in the world."""
+    def surface_points(self, limit: int) -> NDArray[np.float32]:
+        """At most about ``limit`` measured points [N, 3] in the world."""
         ...
 
     def query(self) -> tuple[Callable[[NDArray[np.float32]], Any], Callable[[NDArray[np.float32]], NDArray[np.uint8]]]:

@@ -208,7 +208,7 @@ class Engine:
 
     def _finish(self, run: Run, complete: bool) -> None:
         """Final poses, mesh, summary; an incomplete run ends without the last mapping and without the mesh."""
-        run.end(complete)
+        run.end(complete, self._interrupt(run, lambda: self._control.leaving))
         began = monotonic()
         if complete:
             self._workshop.final(run, self._control)
@@ -216,16 +216,7 @@ class Engine:
 
     def _frames(self, run: Run, frames: Items) -> Turn:
         """Step through the frames as the commands want it; what ended that (STOP also at the sequence's end)."""
-        from_here, last_step = threading.get_ident(), -1e9
-
-        def interrupt() -> None:
-            if self._control.leave_now:
-                raise Abandoned
-            if threading.get_ident() == from_here:
-                self._in_between(run)
-                if monotonic() >= self._next_snapshot + LONG_STEP_S:
-                    self._show(State.MAPPING if run.report else State.INITIALISING)
-
+        interrupt, last_step = self._interrupt(run, lambda: self._control.leave_now), -1e9
         while True:
             run.clock.pause()
             turn = self._control.next_turn(last_step)
@@ -245,6 +236,20 @@ class Engine:
                     run.require_frames()
                     return Turn.STOP
                 self._step(run, item, interrupt)
+
+    def _interrupt(self, run: Run, leave: Callable[[], bool]) -> Callable[[], None]:
+        """What long loops of the engine proper call: it raises Abandoned when ``leave`` answers True."""
+        from_here = threading.get_ident()
+
+        def interrupt() -> None:
+            if leave():
+                raise Abandoned
+            if threading.get_ident() == from_here:
+                self._in_between(run)
+                if monotonic() >= self._next_snapshot + LONG_STEP_S:
+                    self._show(State.MAPPING if run.report else State.INITIALISING)
+
+        return interrupt
 
     def _step(self, run: Run, item: tuple[int, Frame | FrameError], interrupt: Callable[[], None]) -> None:
         try:

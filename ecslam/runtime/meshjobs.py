@@ -17,7 +17,7 @@ from ..messages import MeshReady
 LIVE_TRIANGLES = 100_000
 LIVE_PERIOD_S = 1.0
 LIVE_SHARE = 0.25
-LIVE_POINTS = 200_000
+LIVE_POINTS, MESH_POINTS = 200_000, 2_000_000
 FIRST_AFTER_S = 1.0
 FIRST_VOXEL_M = 0.08
 FINEST_LIVE_VOXEL_M = 0.02
@@ -42,15 +42,13 @@ def build_mesh(
     voxel_m: float,
     max_triangles: int = 0,
     should_stop: Callable[[], bool] | None = None,
-    max_points: int = 0,
 ) -> MeshReady:
     """A coloured mesh of the observed part of a map.
 
     When it has more than ``max_triangles`` (0 = no limit) it is made again with a voxel that keeps to them.
-    max_points: the observed part is found from about so many of the points (0 = all). Raises MeshingStopped.
+    Raises MeshingStopped.
     """
-    stride = -(-len(frozen.points) // max_points) if max_points else 1
-    observed = ObservedBlocks.from_points(frozen.points[:: max(stride, 1)], max(BLOCK_M, voxel_m))
+    observed = ObservedBlocks.from_points(frozen.points, max(BLOCK_M, voxel_m))
     while True:
         mesh = extract_mesh(frozen.sdf, frozen.color, observed, voxel_m, should_stop=should_stop)
         if not max_triangles or len(mesh.faces) <= max_triangles:
@@ -143,7 +141,7 @@ class LiveMeshes:
         """The mesh, or None when there is no surface yet. Called in the job thread."""
         started = monotonic()
         try:
-            ready = build_mesh(frozen, self._voxel_m, LIVE_TRIANGLES, should_stop, LIVE_POINTS)
+            ready = build_mesh(frozen, self._voxel_m, LIVE_TRIANGLES, should_stop)
         finally:
             took = monotonic() - started
             self._due = started + max(LIVE_PERIOD_S, took / LIVE_SHARE)

@@ -19,6 +19,12 @@ def shrink(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def jpeg(image: NDArray[np.uint8]) -> bytes:
+    """A colour image [h, w, 3] as a JPEG file."""
+    _, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return encoded.tobytes()
+
+
 def shrink_depth(depth: NDArray[np.float32], width: int) -> NDArray[np.float32]:
     """A depth image at most ``width`` pixels wide; nearest pixels, so that no depth is made up."""
     if depth.shape[1] <= width:

@@ -20,10 +20,10 @@ from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
-from .driven import SlamFactory, SlamLike
+from .driven import Abandoned, SlamFactory, SlamLike
 from .driven import State as Arrays
-from .meshjobs import FrozenMap
-from .pictures import shrink
+from .meshjobs import MESH_POINTS, FrozenMap
+from .pictures import jpeg, shrink
 from .runfolder import RunFolder
 from .summary import summarise
 from .tally import Stopwatch, Tally
@@ -76,7 +76,7 @@ class Run:
             saved=lambda: folder.found("checkpoints"),
             frame=self.tally.position,
         )
-        self.thumbnails: dict[int, NDArray[np.uint8]] = {}
+        self.thumbnails: dict[int, bytes] = {}
         self._color: NDArray[np.uint8] | None = None
         self.lost_for = 0
         if resumed:
@@ -193,7 +193,7 @@ class Run:
         if len(self.tally.rows) % ATE_EVERY == 0:
             self.measure()
         if report.is_keyframe:
-            self.thumbnails[report.frame] = shrink(frame.color, THUMBNAIL_WIDTH)
+            self.thumbnails[report.frame] = jpeg(shrink(frame.color, THUMBNAIL_WIDTH))
             self.folder.keyframe(report.frame, report.c2w, self.thumbnails[report.frame])
         self.folder.metrics(report, self.ate_cm.rmse if self.ate_cm else None, self._window_poses(report))
         if report.loop is not None:
@@ -241,12 +241,12 @@ class Run:
         error = None if self.truth is None else absolute_error(self.poses(), self.truth[self.tally.rows])
         self.ate_cm = error.cm if error else None
 
-    def freeze(self) -> FrozenMap | None:
-        """The map as it is now, for the job thread; None before there is one."""
+    def freeze(self, points: int = MESH_POINTS) -> FrozenMap | None:
+        """The map as it is now, with about so many measured points at most; None before there is one."""
         if self.slam is None or self.slam.field is None:
             return None
         sdf, color = self.slam.query()
-        return FrozenMap(max(self.tally.position - 1, 0), sdf, color, self.slam.surface_points())
+        return FrozenMap(max(self.tally.position - 1, 0), sdf, color, self.slam.surface_points(points))
 
     def keyframe_poses(self) -> tuple[list[int], NDArray[np.float64]]:
         """Frame indices and poses [k, 4, 4] of the keyframes."""
@@ -279,10 +279,13 @@ class Run:
         """Bring ``trajectory.txt`` up to date."""
         self.folder.write("trajectory.txt", format_tum(self.timestamps(), self.poses()))
 
-    def end(self, complete: bool) -> None:
+    def end(self, complete: bool, interrupt: Callable[[], None]) -> None:
         """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock."""
         if complete and self.slam is not None and self.tally.rows and not self.torn:
-            self.slam.finish()
+            try:
+                self.slam.finish(interrupt)
+            except Abandoned:
+                complete = False
         self.clock.pause()
         self.tally.wall_s = self.clock.seconds
         self.measure()

@@ -29,7 +29,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -127,24 +126,20 @@ class RunFolder:
         kind = "loop" if isinstance(event, LoopEvent) else "notice"
         self._append("events.jsonl", {"type": kind} | {f.name: getattr(event, f.name) for f in fields(event)})
 
-    def keyframe(self, frame: int, c2w: NDArray[np.float64], thumbnail: NDArray[np.uint8]) -> None:
-        """Log a keyframe and save its picture, uint8 [h, w, 3] RGB."""
+    def keyframe(self, frame: int, c2w: NDArray[np.float64], thumbnail: bytes) -> None:
+        """Log a keyframe and save its picture, a JPEG."""
         name = f"thumbnails/{frame:06d}.jpg"
-        _, jpeg = cv2.imencode(".jpg", thumbnail[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
         try:
-            (self.path / name).write_bytes(jpeg.tobytes())
+            (self.path / name).write_bytes(thumbnail)
         except OSError as error:
             self.missing(name, error)
         self._append("keyframes.jsonl", {"frame": frame, "c2w": c2w[:3].reshape(-1), "thumbnail": name})
 
-    def thumbnails(self) -> dict[int, NDArray[np.uint8]]:
-        """The saved keyframe pictures, by frame; black where one is not readable."""
-        found = {}
-        for line in read_lines(self.path / "keyframes.jsonl"):
-            image = cv2.imread(str(self.path / line["thumbnail"]))
-            black = np.zeros((1, 1, 3), np.uint8)
-            found[int(line["frame"])] = black if image is None else np.asarray(image[..., ::-1], np.uint8)
-        return found
+    def thumbnails(self) -> dict[int, bytes]:
+        """The saved keyframe pictures, by frame; those that are still there."""
+        lines = read_lines(self.path / "keyframes.jsonl")
+        paths = {int(line["frame"]): self.path / line["thumbnail"] for line in lines}
+        return {frame: path.read_bytes() for frame, path in paths.items() if path.is_file()}
 
     def loops(self) -> list[LoopEvent]:
         """The loop closures in the log."""

@@ -12,8 +12,6 @@ from .tally import peak_memory_mb
 if TYPE_CHECKING:
     from .run import Run
 
-NO_PICTURE = np.zeros((1, 1, 3), np.uint8)
-
 
 def state_of(run: Run) -> State:
     """What the run is doing, from its last frame."""
@@ -39,7 +37,7 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
         trajectory=poses[tally.row_of_each_frame()] if len(poses) else poses,
         trajectory_gt=run.truth,
         keyframes=tuple(
-            KeyframeView(frame, c2w, run.thumbnails.get(frame, NO_PICTURE))
+            KeyframeView(frame, c2w, run.thumbnails.get(frame, b""))
             for frame, c2w in zip(frames, keyframe_poses, strict=True)
         ),
         window=report.window if report else (),

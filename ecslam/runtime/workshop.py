@@ -11,7 +11,7 @@ from .control import Control
 from .exports import export_job, render_pictures
 from .feed import Feed
 from .mesh_files import mesh_bytes
-from .meshjobs import FrozenMap, JobThread, LiveMeshes, build_mesh
+from .meshjobs import LIVE_POINTS, FrozenMap, JobThread, LiveMeshes, build_mesh
 from .run import Run
 
 MESHES_KEPT = 8
@@ -66,7 +66,7 @@ class Workshop:
 
     def live(self, run: Run, at_once: bool = False) -> None:
         """The periodic mesh, when somebody watches and it is due."""
-        frozen = run.freeze() if self._feed.watched and (at_once or self._live.due) else None
+        frozen = run.freeze(LIVE_POINTS) if self._feed.watched and (at_once or self._live.due) else None
         if frozen is not None:
             self._live.begin()
             self._jobs.submit(lambda: self._make_live(self._live, frozen))
