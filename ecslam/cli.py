@@ -205,6 +205,37 @@ def bench_speed(
         plot_speed(result, plot)
 
 
+@bench.command(name="accuracy")
+def bench_accuracy(
+    sequence: SequenceArgument = "synthetic/studio",
+    presets: Annotated[str, typer.Option(help="Presets to run, separated by commas.")] = "lite",
+    frames: Frames = "",
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each, with seeds 0, 1, ...")] = 3,
+    ablate: Annotated[bool, typer.Option("--ablate", help="Also without FUS, without EBA, without both.")] = False,
+    no_surface: Annotated[bool, typer.Option("--no-surface", help="Trajectories only: saves a minute a run.")] = False,
+    settings: Settings = None,
+    device: Device = "auto",
+    json: Annotated[Path | None, typer.Option(help="Write every figure to this file.")] = None,
+) -> None:
+    """Trajectory and surface against the ground truth, mean and deviation over seeds; the paper's ablation."""
+    from . import commands
+    from .bench.accuracy import bench_accuracy, print_table
+
+    names = [name.strip() for name in presets.split(",")]
+    result = bench_accuracy(
+        sequence,
+        names,
+        frames,
+        seeds,
+        commands.pick_device(device),
+        ablate=ablate,
+        surface=not no_surface,
+        settings=settings or [],
+    )
+    print_table(result)
+    commands.write_json(json, result)
+
+
 def resolve_config(
     preset: str,
     layout: str,

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import platform
 import resource
 import statistics
 import tempfile
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +15,15 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from ..config import Config, for_layout, load_config, load_preset
 from ..datasets import open_sequence, select_frames
 from ..messages import Snapshot
 from ..runtime.checkpoint import load_checkpoint
 from ..runtime.engine import Engine
 from ..runtime.tally import peak_memory_mb
-from ..types import Sequence
 from .peer import measure_open3d, open3d_missing
+from .runs import in_own_process, preset_config, progress, say
 
 SPAN = 200
 SMOOTH = 25
@@ -62,7 +57,7 @@ def bench_speed(
     """
     opened = select_frames(open_sequence(sequence), frames)
     for preset in presets:
-        _config(preset, opened)
+        preset_config(preset, opened)
     note = open3d_missing() if peer else ""
     jobs: dict[str, tuple[Callable[..., Figures], tuple[str, ...]]] = {
         preset: (measure, (sequence, preset, frames, device)) for preset in presets
@@ -72,8 +67,8 @@ def bench_speed(
     runs: dict[str, list[Figures]] = {name: [] for name in jobs}
     for turn in range(repeats):
         for name, (job, arguments) in jobs.items():
-            runs[name].append(_in_own_process(job, arguments))
-            _say(f"{name}, run {turn + 1} of {repeats}: {runs[name][-1]['fps_wall']:.2f} frames/s")
+            runs[name].append(in_own_process(job, arguments))
+            say(f"{name}, run {turn + 1} of {repeats}: {runs[name][-1]['fps_wall']:.2f} frames/s")
     medians = {name: _medians(found) for name, found in runs.items()}
     rival = medians.pop(PEER, None)
     return {
@@ -104,8 +99,8 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
     opened = open_sequence(sequence)
     with tempfile.TemporaryDirectory(prefix="ecslam-bench-") as parent:
         folder = Path(parent) / "run"
-        engine = Engine(_config(preset, opened), opened, folder, device=device, frames=frames)
-        with _progress(preset) as show:
+        engine = Engine(preset_config(preset, opened), opened, folder, device=device, frames=frames)
+        with progress(preset) as show:
 
             def watch(snapshot: Snapshot) -> None:
                 memory[snapshot.frame] = _resident_mb()
@@ -171,31 +166,6 @@ def plot_speed(result: Figures, path: Path) -> None:
         each.set_ylim(bottom=0)
     axes.legend(frameon=False)
     figure.savefig(path, format="png")
-
-
-def _config(preset: str, sequence: Sequence) -> Config:
-    """What ``ecslam run`` would use: with --config for a YAML file, else with --preset."""
-    if preset.endswith((".yaml", ".yml")):
-        return load_config(Path(preset), for_layout(load_preset(sequence.preset), sequence.layout))
-    return for_layout(load_preset(preset), sequence.layout)
-
-
-@contextmanager
-def _progress(preset: str) -> Iterator[Callable[[Snapshot], None]]:
-    """What to call with every snapshot of a run, for a bar on stderr."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, refresh_per_second=2) as bar:
-        task = bar.add_task(preset, total=None)
-        yield lambda s: bar.update(task, completed=s.frame + 1, total=s.frames_total)
-
-
-def _in_own_process(job: Callable[..., Figures], arguments: tuple[str, ...]) -> Figures:
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(job, *arguments).result()
-
-
-def _say(text: str) -> None:
-    Console(stderr=True).print(text, highlight=False)
 
 
 def _medians(runs: list[Figures]) -> Figures:

@@ -69,6 +69,12 @@ def observed(
     return seen
 
 
+def framed(points: NDArray[np.floating], poses: NDArray[np.float64], intrinsics: Intrinsics) -> NDArray[np.bool_]:
+    """bool [N]: which points [N, 3] lie in the frustum of at least one of the poses [M, 4, 4], hidden or not."""
+    endless = np.full((intrinsics.height, intrinsics.width), np.inf, np.float32)
+    return observed(points, poses, intrinsics, lambda index: endless)
+
+
 def culled(mesh: Mesh, seen: NDArray[np.bool_]) -> Mesh:
     """The faces with a corner among the seen vertices (bool [V])."""
     return part(mesh, faces_seen(mesh, seen))
@@ -77,3 +83,8 @@ def culled(mesh: Mesh, seen: NDArray[np.bool_]) -> Mesh:
 def faces_seen(mesh: Mesh, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """bool [F] from bool [V]: at least one corner was seen."""
     return np.asarray(seen[mesh.faces].any(1))
+
+
+def faces_seen_whole(mesh: Mesh, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """bool [F] from bool [V]: all corners were seen."""
+    return np.asarray(seen[mesh.faces].all(1))

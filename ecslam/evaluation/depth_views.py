@@ -6,9 +6,11 @@ view's mean absolute difference. Only pixels where the reference has a surface c
 depth is 0.
 
 What differs: places are drawn where a camera saw free space, so never inside furniture or walls and in every room of a
-flat (there: one box for each scene, moved by hand); pixels where the reference shows what no camera saw don't count,
-and a view with more than half such or empty pixels is left out (there: one with any unseen vertex in its frustum, even
-behind a wall; where occluded parts count as unseen hardly a view would be left).
+flat (there: one box for each scene, moved by hand); pixels where the reference shows what no camera saw don't count (a
+face with an unseen corner does not), and a view with more than half such or empty pixels is left out (there: one with
+any unseen vertex in its frustum, even behind a wall; where occluded parts count as unseen hardly a view would be left).
+The estimate keeps what lay in a camera's frustum, hidden or not: in Co-SLAM's protocol virtual cameras keep what can be
+seen from inside the scene, which for these views comes to the same.
 """
 
 from __future__ import annotations
@@ -78,7 +80,7 @@ def depth_l1(
 ) -> DepthError | None:
     """Mean absolute difference of depth over the first ``wanted`` of the views [N, 4, 4] that count; None if none does.
 
-    reference: the whole of it, with bool [F] telling which faces a camera saw. estimate: already culled.
+    reference: the whole of it, with bool [F] telling which faces cameras saw whole. estimate: already culled.
     """
 
     def difference(c2w: NDArray[np.float64]) -> float | None:

@@ -8,7 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import InputError, Intrinsics, Mesh
-from .culling import OCCLUSION_MARGIN_M, culled, faces_seen, observed, rendered_depth, spread_frames
+from .culling import (
+    OCCLUSION_MARGIN_M,
+    culled,
+    faces_seen,
+    faces_seen_whole,
+    framed,
+    observed,
+    rendered_depth,
+    spread_frames,
+)
 from .depth_views import TRIES_PER_VIEW, depth_l1, random_views, up_direction, viewpoint_candidates
 from .reconstruction import register, surface_error
 from .surface import moved, part, sample_surface, subdivided
@@ -54,10 +63,12 @@ def evaluate_run(
     reference = subdivided(reference, LONGEST_EDGE_M)
     places = viewpoint_candidates(_bounds(reference), up, TRIES_PER_VIEW * views, rng)
     seen, places = _look_at_reference(reference, places, poses, camera, lambda done: report(0.15 * done))
-    mesh = _seen_part(subdivided(mesh, LONGEST_EDGE_M), poses, camera, lambda done: report(0.15 + 0.15 * done))
+    mesh = subdivided(mesh, LONGEST_EDGE_M)
+    mesh = culled(mesh, framed(mesh.vertices, poses, camera))
+    shown = _seen_part(mesh, poses, camera, lambda done: report(0.15 + 0.15 * done))
 
-    truth = sample_surface(part(reference, seen), samples, rng)
-    points = sample_surface(mesh, samples, rng)
+    truth = sample_surface(part(reference, faces_seen(reference, seen)), samples, rng)
+    points = sample_surface(shown, samples, rng)
     if not len(points):
         return dict.fromkeys(("depth_l1_cm", "accuracy_cm", "completion_cm", "completion_ratio"))
     if align:
@@ -65,7 +76,8 @@ def evaluate_run(
         mesh, points = moved(mesh, motion), motion.apply(points)
     surface = surface_error(points, truth)
     looks = random_views(places, up, rng)
-    depth = depth_l1(mesh, reference, seen, looks, views, progress=lambda done: report(0.4 + 0.6 * done))
+    whole = faces_seen_whole(reference, seen)
+    depth = depth_l1(mesh, reference, whole, looks, views, progress=lambda done: report(0.4 + 0.6 * done))
     report(1.0)
     return {
         "depth_l1_cm": depth.cm if depth else None,
@@ -78,12 +90,12 @@ def evaluate_run(
 def _look_at_reference(
     reference: Mesh, places: NDArray[np.float64], poses: Poses, camera: Intrinsics, progress: Progress
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Which faces (bool [F]) the cameras saw, and those of the places [N, 3] that they saw to be free."""
+    """Which vertices (bool [V]) the cameras saw, and those of the places [N, 3] that they saw to be free."""
     points = np.concatenate([reference.vertices, places])
     margins = np.full(len(points), -CLEARANCE_M)
     margins[: len(reference.vertices)] = OCCLUSION_MARGIN_M
     hit = observed(points, poses, camera, rendered_depth(reference, poses, camera), margins, progress=progress)
-    seen = faces_seen(reference, hit[: len(reference.vertices)])
+    seen = hit[: len(reference.vertices)]
     if not seen.any():
         raise InputError("evaluation: the cameras see nothing of the reference mesh; check that their worlds agree")
     return seen, places[hit[len(reference.vertices) :]]

@@ -1,0 +1,46 @@
+"""What every benchmark of whole runs needs: a process of its own, a bar, and the configuration of a preset."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ..config import Config, for_layout, load_config, load_preset
+from ..messages import Snapshot
+from ..types import Sequence
+
+Figures = dict[str, Any]
+
+
+def preset_config(preset: str, sequence: Sequence) -> Config:
+    """What ``ecslam run`` would use: with --config for a YAML file, else with --preset. Raises InputError."""
+    if preset.endswith((".yaml", ".yml")):
+        return load_config(Path(preset), for_layout(load_preset(sequence.preset), sequence.layout))
+    return for_layout(load_preset(preset), sequence.layout)
+
+
+def in_own_process(job: Callable[..., Figures], arguments: tuple[Any, ...]) -> Figures:
+    """``job(*arguments)`` in a fresh process, so that memory and thread pools are its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(job, *arguments).result()
+
+
+@contextmanager
+def progress(name: str) -> Iterator[Callable[[Snapshot], None]]:
+    """What to call with every snapshot of a run, for a bar on stderr."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, refresh_per_second=2) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda s: bar.update(task, completed=s.frame + 1, total=s.frames_total)
+
+
+def say(text: str) -> None:
+    """A line on stderr."""
+    Console(stderr=True).print(text, highlight=False)

@@ -1,0 +1,76 @@
+"""A run folder against the ground truth of its sequence: all figures of the paper's tables."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import datasets
+from ..datasets.meshes import load_mesh
+from ..evaluation.trajectory import absolute_error, relative_error
+from ..evaluation.trajectory_io import read_tum
+from ..types import InputError, Mesh
+from .files import write_atomic
+
+
+def judge_run(
+    folder: Path, progress: Callable[[float], None] | None = None, *, surface: bool = True
+) -> dict[str, float]:
+    """The figures that need ground truth, also written into the run's ``summary.json``.
+
+    ate_*_cm, rpe_cm, rpe_deg and, where the sequence has a reference mesh, depth_l1_cm, accuracy_cm, completion_cm,
+    completion_ratio (per cent). progress: gets the share done in 0..1. surface: False leaves out the latter, which
+    take a minute. Raises InputError without a finished run or ground truth.
+    """
+    from ..evaluation.report import evaluate_run
+
+    summary_path, about_path = folder / "summary.json", folder / "run.json"
+    if not summary_path.is_file() or not about_path.is_file():
+        raise InputError(f"{folder}: no finished run here; give the folder that `ecslam run --out` wrote")
+    summary, about = json.loads(summary_path.read_text()), json.loads(about_path.read_text())
+    times, poses = read_tum(folder / "trajectory.txt")
+    truth = read_truth(folder, times)
+    if truth is None:
+        raise InputError(f"{folder}: the sequence has no ground truth, so there is nothing to compare with")
+    figures = _trajectory_figures(poses, truth)
+    sequence = datasets.select_frames(datasets.open_sequence(about["sequence"]), about["frames"])
+    reference = sequence.reference_mesh() if surface else None
+    if reference is not None:
+        mesh = read_mesh(folder / "mesh.ply")
+        found = evaluate_run(mesh, reference, sequence.intrinsics, truth, progress=progress)
+        figures |= {name: value for name, value in found.items() if value is not None}
+    write_atomic(summary_path, json.dumps(summary | figures, indent=2).encode())
+    return figures
+
+
+def _trajectory_figures(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, float]:
+    figures: dict[str, float] = {}
+    ate, rpe = absolute_error(poses, truth), relative_error(poses, truth)
+    if ate is not None:
+        figures |= {f"ate_{name}_cm": getattr(ate.cm, name) for name in ("rmse", "mean", "median", "max")}
+    if rpe is not None:
+        figures |= {"rpe_cm": rpe.cm.rmse, "rpe_deg": rpe.deg.rmse}
+    return figures
+
+
+def read_truth(folder: Path, times: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Ground-truth poses [N, 4, 4] at ``times`` [N], NaN where there is none; None without ground truth."""
+    path = folder / "groundtruth.txt"
+    if not path.is_file():
+        return None
+    found_times, found = read_tum(path)
+    truth = np.full((len(times), 4, 4), np.nan)
+    at = np.searchsorted(times, found_times).clip(0, len(times) - 1)
+    truth[at] = found
+    return truth
+
+
+def read_mesh(path: Path) -> Mesh:
+    """A mesh file of ours. Raises InputError."""
+    if not path.is_file():
+        raise InputError(f"{path}: no mesh here; make it with: ecslam mesh {path.parent}")
+    return load_mesh(path)

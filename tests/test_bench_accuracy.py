@@ -1,0 +1,58 @@
+"""The accuracy benchmark: every variant runs with every seed, a failed run is counted, figures are those of `eval`."""
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from ecslam.bench import accuracy
+from ecslam.types import InputError
+
+TINY = """
+preset: lite
+field: {levels: 4, log2_table_size: 12}
+tracking: {iterations: 1, rays: 100}
+mapping: {first_iterations: 5, iterations: 2, final_iterations: 3, rays: 100}
+"""
+ROOM = "synthetic/studio?size=96x72"
+
+
+@pytest.mark.slow
+def test_a_tiny_ablation(tmp_path):
+    preset = tmp_path / "tiny.yaml"
+    preset.write_text(TINY)
+    result = accuracy.bench_accuracy(
+        ROOM, [str(preset)], "0:6", 1, "cpu", ablate=True, surface=False, settings=["mapping.every=5"]
+    )
+    assert [name.removeprefix(str(preset)) for name in result["variants"]] == [
+        "",
+        " without FUS",
+        " without EBA",
+        " without both",
+    ]
+    for runs in result["variants"].values():
+        assert len(runs) == 1
+        assert runs[0]["seed"] == 0
+        assert runs[0]["frames"] == 6
+        assert runs[0]["ate_rmse_cm"] > 0
+
+
+def test_means_deviations_and_failures_are_shown():
+    runs = [{"ate_rmse_cm": 1.0}, {"ate_rmse_cm": 3.0}, {"error": "the map exploded"}]
+    other = [{"ate_rmse_cm": 5.0, "depth_l1_cm": 0.75}]
+    about = {"sequence": "a", "frames": "0:9", "settings": ["fus=false"], "seeds": 3}
+    text = io.StringIO()
+    accuracy.print_table(about | {"variants": {"lite": runs, "full": other}}, Console(file=text, width=100))
+    assert re.search(r"ATE RMSE \(cm\) +│ +2\.00 ± 1\.41 │ +5\.00", text.getvalue())
+    assert re.search(r"Depth L1 \(cm\) +│ +│ +0\.75", text.getvalue())
+    assert re.search(r"failed runs +│ +1 │ +0", text.getvalue())
+    assert "fus=false" in text.getvalue()
+
+
+def test_what_cannot_run_is_refused_before_anything_runs(tmp_path):
+    with pytest.raises(InputError, match="no such preset"):
+        accuracy.bench_accuracy(ROOM, ["lite", "lighter"], "0:2", 1, "cpu", ablate=False, surface=True, settings=[])
+    how = {"ablate": False, "surface": True, "settings": ["maping.iterations=3"]}
+    with pytest.raises(InputError, match="unknown key 'maping'"):
+        accuracy.bench_accuracy(ROOM, ["lite"], "0:2", 1, "cpu", **how)
