@@ -108,7 +108,8 @@ class MappingConfig:
 
     newest_share: of the rays, for the newest keyframe. rim: whether the stored pixels reach into the border of
     ``border_px`` (ours; without them what is only ever seen there stays unmapped). final_iterations: of the map alone,
-    on all keyframes, after the last frame (ours).
+    on all keyframes, after the last frame, with the weights ``final_loss`` (ours: more for the tail, which brings out
+    edges and thin things).
     """
 
     every: int = _number(5, 1, 1000)
@@ -123,6 +124,7 @@ class MappingConfig:
     lr_rotation: float = _number(1e-4, 0.0, 1.0)
     lr_translation: float = _number(1e-4, 0.0, 1.0)
     loss: LossWeights = LossWeights()
+    final_loss: LossWeights = LossWeights(tail=50.0)
     smooth_weight: float = _number(1e-6, 0.0)
     smooth_points: int = _number(32, 2, 256)
     smooth_voxel_m: float = _number(0.1, 1e-3, 1.0)

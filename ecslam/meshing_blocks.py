@@ -12,6 +12,7 @@ from .meshing_table import CORNERS
 EDGE = 8
 """Lattice points along one edge of a block."""
 
+_POINTS_AT_ONCE = 1 << 17
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
 _ORIGIN = (_HALF << 2 * _BITS) + (_HALF << _BITS) + _HALF
@@ -55,7 +56,10 @@ class ObservedBlocks:
     @classmethod
     def from_points(cls, points: NDArray[np.floating], block_m: float = 0.08) -> ObservedBlocks:
         """The blocks around surface points [N, 3] (metres, world)."""
-        return cls(block_m).merged(points)
+        out = cls(block_m)
+        for start in range(0, len(points), _POINTS_AT_ONCE):
+            out = out.merged(points[start : start + _POINTS_AT_ONCE])
+        return out
 
     def merged(self, points: NDArray[np.floating]) -> ObservedBlocks:
         """These blocks and those around further points [N, 3]; costs a sort of the new keys only."""

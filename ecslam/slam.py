@@ -168,7 +168,7 @@ class Slam:
     def _settle(self, interrupt: Interrupt | None) -> None:
         """Every part of the map gets its last iterations at a falling rate, not only what the last windows saw."""
         assert self.mapper is not None
-        mapping = replace(self.config.mapping, newest_share=0.0)
+        mapping = replace(self.config.mapping, newest_share=0.0, loss=self.config.mapping.final_loss)
         rows = _spread(len(self.keyframes), mapping.rays // SETTLE_RAYS)
         views, poses = [self.keyframes[i].pixels for i in rows], self.trajectory.keyframe_poses()[rows]
         fixed, config = np.ones(len(rows), bool), replace(self.config, mapping=mapping)

@@ -79,7 +79,7 @@ class Workshop:
     def keep(self, run: Run) -> None:
         """A few meshes over the run, for looking back later."""
         if run.tally.position % -(-len(run.plan.sequence) // MESHES_KEPT) == 0:
-            frozen = run.freeze()
+            frozen = run.freeze(LIVE_POINTS)
             if frozen is not None:
                 name = f"meshes/{frozen.frame:06d}.ply"
                 self._jobs.submit(lambda: self._save(run, name, frozen, KEPT_VOXEL_M, KEPT_TRIANGLES))
