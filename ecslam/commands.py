@@ -6,6 +6,7 @@ import json
 import sys
 import threading
 import webbrowser
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from . import datasets
 from .config import Config
 from .evaluation.trajectory_io import read_tum
-from .messages import Snapshot
+from .messages import Snapshot, State
 from .runtime.checkpoint import load_checkpoint
 from .runtime.driven import import_slam
 from .runtime.engine import Engine
@@ -95,7 +96,7 @@ def run_headless(engine: Engine) -> None:
             bar.update(task, description=progress_line(s), completed=s.frame + 1, total=s.frames_total)
 
         summary = engine.run(show)
-    finish_run(engine, summary)
+    finish_run(engine.run_folder, summary)
 
 
 def progress_line(s: Snapshot) -> str:
@@ -111,17 +112,17 @@ def progress_line(s: Snapshot) -> str:
 
 
 def run_with_dashboard(engine: Engine, host: str, port: int, browser: bool) -> None:
-    """Run in the background under the dashboard until Ctrl-C."""
+    """Run in the background under the dashboard until Ctrl-C; a finished run is reported while the page stays up."""
     from ecslam_app import server
 
+    reports = Reports(engine)
     with quit_on_signals(engine):
         dashboard = server.start(engine, host, port)
         _announce(dashboard, browser)
-        engine.start()
+        engine.start(reports.watch)
         engine.join()
     dashboard.close()
-    if engine.summary is not None:
-        finish_run(engine, engine.summary)
+    reports.close()
     if engine.error is not None:
         raise engine.error
 
@@ -138,9 +139,34 @@ def view(folders: list[Path], host: str, port: int, browser: bool) -> None:
         dashboard.close()
 
 
-def finish_run(engine: Engine, summary: dict[str, Any]) -> None:
+class Reports:
+    """Reports every run of an engine once, as soon as it is over, on a thread of its own: drawing takes seconds."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._pool = ThreadPoolExecutor(1, "report")
+        self._made: dict[Path, Future[None]] = {}
+
+    def watch(self, s: Snapshot) -> None:
+        """Take every snapshot, on the engine's thread."""
+        if s.state is State.FINISHED:
+            self._report()
+
+    def _report(self) -> None:
+        folder, summary = self._engine.run_folder, self._engine.summary
+        if summary is not None and folder not in self._made:
+            self._made[folder] = self._pool.submit(finish_run, folder, summary)
+
+    def close(self) -> None:
+        """Report a run that was left early too, and return when all is said. Raises what a report raised."""
+        self._report()
+        for made in self._made.values():
+            made.result()
+        self._pool.shutdown()
+
+
+def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     """Draw the picture of the run, print its figures and where they lie."""
-    folder = engine.run_folder
     picture = draw_picture(folder)
     for name in ("sequence", "preset", "kernels", "frames", "fps_wall", "ate_rmse_cm", "loop_closures", "lost_frames"):
         value = summary[name]
