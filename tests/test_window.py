@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecslam.config import WindowConfig
+from ecslam.datasets.synthetic import ROOMS, open_synthetic
 from ecslam.loops import LoopDetector, RevisitRule, revisited
 from ecslam.window import parallax, random_window, select_window
 
@@ -88,3 +89,17 @@ def test_one_event_for_one_return():
     events = [k for k in range(1, len(poses)) if len(detector.update(poses[:k], poses[k - 1]))]
     assert len(events) >= 1
     assert 80 < events[0] < 110
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_closes_its_loop_where_the_path_comes_back_and_nowhere_before(room):
+    poses = open_synthetic(room).poses_gt()[::5]
+    detector = LoopDetector()
+    met = [detector.update(poses[: k + 1], poses[k]) for k in range(len(poses))]
+    events = [k for k, old in enumerate(met) if len(old)]
+    away_m = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
+    turned_deg = np.degrees(np.arccos((poses[:, :3, 2] @ poses[0, :3, 2]).clip(-1, 1)))
+    here = (away_m < 0.7) & (turned_deg < 30)
+    left = int(np.argmin(here))
+    assert events == [left + int(np.argmax(here[left:]))]
+    assert met[events[0]].tolist() == [0]
