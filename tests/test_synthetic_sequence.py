@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +13,7 @@ from ecslam.datasets import open_sequence
 from ecslam.datasets.synthetic import ROOMS, Address, open_synthetic, parse_address, write_replica
 from ecslam.datasets.synthetic.noise import BASELINE_FOCAL, DISPARITY_SIGMA, DISPARITY_STEP, kinect
 from ecslam.datasets.synthetic.sequence import room
+from ecslam.kernels.raster import rasterize
 from ecslam.se3 import inverse, rotation_angle_deg
 from ecslam.types import InputError, Intrinsics, Sequence
 from tests.synthetic_oracles import distances, look_up, on_surface, points_of
@@ -88,7 +90,9 @@ def test_mesh_is_the_surface(name):
     mesh, shapes = sequence.reference_mesh(), room(name).shapes
     rng = np.random.default_rng(0)
     some = mesh.vertices[rng.integers(len(mesh.vertices), size=1500)].astype(np.float64)
-    assert on_surface(shapes, some).max() < 1e-5
+    away = on_surface(shapes, some)
+    assert away.max() < 3.1e-4  # where a chord of a curved solid is cut
+    assert np.median(away) < 1e-5
     faces = mesh.faces[rng.integers(len(mesh.faces), size=1500)]
     assert on_surface(shapes, mesh.vertices[faces].astype(np.float64).mean(1)).max() < 3.1e-4
     assert mesh.colors is not None
@@ -111,14 +115,30 @@ def test_mesh_covers_what_the_camera_sees_in_its_colours():
     assert np.median(error) < 15
 
 
+@pytest.mark.parametrize("name", ["studio", "corridor"])
+def test_mesh_has_no_gaps_where_surfaces_meet(name):
+    sequence = open_synthetic(name, width=320, height=240)
+    mesh = sequence.reference_mesh()
+    wrong = []
+    for index in range(0, len(sequence), 40):
+        truth = sequence[index]
+        depth, _ = rasterize(mesh, sequence.intrinsics, truth.c2w_gt)
+        away = np.abs(depth - truth.depth) > 0.001
+        outline = cv2.morphologyEx(truth.depth, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0.05  # curved ones are chords
+        wrong.append(away[~outline])
+    assert np.concatenate(wrong).mean() < 5e-4
+
+
 def test_mesh_faces_look_out_of_solids_into_the_room():
     mesh, shapes = open_synthetic("studio").reference_mesh(), room("studio").shapes
     corner = mesh.vertices[np.random.default_rng(1).permutation(mesh.faces)[:1500]].astype(np.float64)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     middle = corner.mean(1)
-    assert (distances(shapes, middle + 0.0008 * normal) > 0).all()
-    assert (distances(shapes, middle - 0.0008 * normal) < 0).all()
+    overlap = 0.0005  # at borders
+    assert (distances(shapes, middle + 0.0008 * normal) > -overlap).all()
+    assert (distances(shapes, middle + 0.0008 * normal) > 0).mean() > 0.98
+    assert (distances(shapes, middle - 0.0008 * normal) < overlap).all()
 
 
 def test_noise_grows_with_the_square_of_depth():

@@ -14,11 +14,11 @@ from .scene import Scene
 from .shapes import BOX, ELLIPSOID, ROUND, Shape
 from .solids import F
 from .surface import face_of, finish, shade
-from .tracing import build, buried
+from .trimming import trim
 
 TOLERANCE_M = 0.00015  # along each of two directions
 GRID_M = 0.1
-LIFT_M = 0.001
+SAME_M = 1e-6
 
 Points = NDArray[np.float64]
 
@@ -26,7 +26,8 @@ Points = NDArray[np.float64]
 def reference_mesh(shapes: Many[Shape], scene: Scene, interior: NDArray[np.float64]) -> Mesh:
     """Triangles of all surfaces inside the box ``interior`` [2, 3], without those that another solid covers.
 
-    Vertices lie on the solids; colours are those of the pictures, averaged over a few centimetres.
+    Vertices lie on the solids, those of cut triangles on their chords; colours are those of the pictures, averaged over
+    a few centimetres.
     """
     parts = [_triangulate(shape) for shape in shapes]
     counts = [len(points) for points, _, _ in parts]
@@ -35,24 +36,25 @@ def reference_mesh(shapes: Many[Shape], scene: Scene, interior: NDArray[np.float
     up = np.concatenate([normals for _, normals, _ in parts])
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     faces = np.concatenate([f + o for (_, _, f), o in zip(parts, first, strict=True)])
+    whole, cut_owner, cut = trim(scene, owner[faces[:, 0]], np.concatenate([local, up], 1)[faces], interior)
+    used, compact = np.unique(faces[whole], return_inverse=True)
+    extra, extra_faces = _joined(cut_owner, cut)
+    owner = np.concatenate([owner[used], extra[:, 0].astype(np.intp)])
+    local = np.concatenate([local[used], extra[:, 1:4]])
+    up = np.concatenate([up[used], extra[:, 4:]])
+    faces = np.concatenate([compact.reshape(-1, 3), extra_faces + len(used)])
     world = np.einsum("nij,nj->ni", scene.rotation[owner], local) + scene.center[owner]
-    faces = _visible(scene, world, owner, faces, interior)
-    used, compact = np.unique(faces, return_inverse=True)
-    colors = _colors(*scene[:4], owner[used], np.float32(local[used]), np.float32(up[used]), F((GRID_M / 2) ** 4), TONE)
-    return Mesh(np.float32(world[used]), compact.reshape(-1, 3).astype(np.int32), colors)
+    colors = _colors(*scene[:4], owner, np.float32(local), np.float32(up), F((GRID_M / 2) ** 4), TONE)
+    return Mesh(np.float32(world), faces.astype(np.int32), colors)
 
 
-def _visible(
-    scene: Scene, world: Points, owner: NDArray[np.intp], faces: NDArray[np.intp], interior: Points
-) -> NDArray[np.intp]:
-    corner = world[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    area = np.linalg.norm(normal, axis=1) / 2
-    middle = corner.mean(1)
-    keep = (area > 1e-10) & ((middle > interior[0]) & (middle < interior[1])).all(1)
-    above = np.float32(middle[keep] + LIFT_M / 2 * normal[keep] / area[keep, None])
-    hidden = _buried(scene.numbers, scene.values, *build(scene), above, owner[faces[keep, 0]])
-    return faces[keep][~hidden]
+def _joined(owner: NDArray[np.intp], corners: Points) -> tuple[Points, NDArray[np.intp]]:
+    """Triangles [P, 3, 6] with shared vertices: rows [V, 7] of owner, point and normal, and faces [P, 3]."""
+    rows = np.concatenate([np.repeat(owner, 3)[:, None], corners.reshape(-1, 6)], 1)
+    _, first, faces = np.unique(
+        (rows / SAME_M).round().astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+    return rows[first], faces.reshape(-1, 3)
 
 
 def _triangulate(shape: Shape) -> tuple[Points, Points, NDArray[np.intp]]:
@@ -165,15 +167,6 @@ def _vertex_normals(points: Points, faces: NDArray[np.intp]) -> Points:
     for k in range(3):
         np.add.at(out, faces[:, k], normal)
     return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-20)
-
-
-@njit(cache=True, nogil=True)
-def _buried(numbers, values, box, skip, leaf, local, points, owner):
-    out = np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        out[i] = buried(numbers, values, box, skip, leaf, local, x, y, z, owner[i])
-    return out
 
 
 @njit(cache=True, nogil=True)

@@ -116,3 +116,27 @@ def buried(numbers, values, box, skip, leaf, local, x, y, z, owner):
             if distance(kind, hx, hy, hz, extra, px, py, pz) < ZERO:
                 return True
     return False
+
+
+@lean
+def clearance(numbers, values, box, skip, leaf, local, x, y, z, owner, reach):
+    """Distance from a point to the nearest shape other than ``owner``, negative inside one; ``reach`` where all are
+    farther than that."""
+    node, free = 0, reach
+    while node < len(skip):
+        n, wide = at(node), max(free, ZERO)
+        near = (
+            box[n, 0] - wide <= x <= box[n, 3] + wide
+            and box[n, 1] - wide <= y <= box[n, 4] + wide
+            and box[n, 2] - wide <= z <= box[n, 5] + wide
+        )
+        if not near:
+            node = skip[n]
+            continue
+        k = leaf[n]
+        node += 1
+        if k >= 0 and k != owner:
+            kind, hx, hy, hz, extra = solid(numbers, values, k)
+            px, py, pz = to_local(local, k, x, y, z, ONE)
+            free = min(free, distance(kind, hx, hy, hz, extra, px, py, pz))
+    return free
