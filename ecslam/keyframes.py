@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .pixels import Pixels
+from .config import Config
+from .pixels import Pixels, choose_pixels
+from .types import Frame, Intrinsics
 
 THUMBNAIL = (40, 30)
 
@@ -20,6 +22,15 @@ class Keyframe:
     frame: int
     pixels: Pixels
     thumbnail: NDArray[np.float32]
+
+
+def make_keyframe(frame: Frame, camera: Intrinsics, config: Config, rng: np.random.Generator) -> Keyframe:
+    """Choose and keep ``keyframe_share`` of a frame's pixels."""
+    count = max(64, round(config.keyframe_share * frame.depth.size))
+    pixels = choose_pixels(frame, camera, count, config, rng, rim=config.mapping.rim)
+    if not config.sampling.without_depth:
+        pixels = pixels.take(np.flatnonzero(pixels.depth > 0))
+    return Keyframe(frame.index, pixels, make_thumbnail(frame.color))
 
 
 def make_thumbnail(color: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .messages import LoopEvent
+from .rigid import rotation_angle_deg
 from .window import parallax
 
 
@@ -51,3 +53,30 @@ class LoopDetector:
         begins = len(old) > 0 and not self.inside
         self.inside = len(old) > 0
         return old if begins else old[:0]
+
+
+def loop_event(
+    frame: int,
+    keyframes: tuple[int, ...],
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    loss_before: float,
+    loss_after: float,
+    centres: NDArray[np.float32],
+) -> LoopEvent:
+    """What a closure did: the pose [4, 4] of ``frame`` before and after, the objective, and all camera centres [n, 3]
+    before it. The errors against ground truth are for those who know it."""
+    return LoopEvent(
+        frame=frame,
+        keyframes=keyframes,
+        correction_cm=100 * float(np.linalg.norm(after[:3, 3] - before[:3, 3])),
+        correction_deg=float(rotation_angle_deg(before, after)),
+        loss_before=loss_before,
+        loss_after=loss_after,
+        error_before_cm=None,
+        error_after_cm=None,
+        rotation_error_before_deg=None,
+        rotation_error_after_deg=None,
+        trajectory_before=centres,
+        c2w_before=before,
+    )

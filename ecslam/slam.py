@@ -19,15 +19,15 @@ from . import kernels as seam
 from .align import LearnedSurface, Surface, align, cost_at, known_points
 from .config import Config
 from .field import TsdfField, box_of_points, create_field
-from .keyframes import Keyframe, make_thumbnail, most_similar
-from .loops import LoopDetector
+from .keyframes import Keyframe, make_keyframe, make_thumbnail, most_similar
+from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
 from .observed import ObservedVoxels
 from .pixels import Pixels, choose_pixels, spread_pixels
 from .recovery import Recovery, best_start
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
-from .se3 import retract, rotation_angle_deg
+from .se3 import retract
 from .tracker import TrackResult, fit, track_adam, track_direct
 from .trajectory import Trajectory
 from .types import Frame, FrameError, InputError, Intrinsics
@@ -99,7 +99,7 @@ class Slam:
         tracked = time.perf_counter()
         losses, loop = track.losses, None
         if keyframe:
-            self._add_keyframe(frame)
+            self.keyframes.append(make_keyframe(frame, self.intrinsics, self.config, self._rng))
         if keyframe and index % self.config.mapping.every == 0:
             losses, loop = self._map(frame.index, interrupt)
         return StepReport(
@@ -119,7 +119,7 @@ class Slam:
 
     def _first_frame(self, frame: Frame, interrupt: Interrupt | None) -> StepReport:
         started = time.perf_counter()
-        keyframe = self._make_keyframe(frame)
+        keyframe = make_keyframe(frame, self.intrinsics, self.config, self._rng)
         if len(keyframe.pixels.points()) == 0:
             raise FrameError(f"frame {frame.index}: no usable depth, so the map cannot start here")
         box = self._bounds
@@ -251,21 +251,8 @@ class Slam:
         self._apply(result)
         if len(old) == 0:
             return result.losses, None
-        after = self.trajectory[-1]
-        return result.losses, LoopEvent(
-            frame=frame,
-            keyframes=tuple(self.keyframes[i].frame for i in old),
-            correction_cm=100 * float(np.linalg.norm(after[:3, 3] - before[:3, 3])),
-            correction_deg=float(rotation_angle_deg(before, after)),
-            loss_before=result.loss_first,
-            loss_after=sum(result.losses.values()),
-            error_before_cm=None,
-            error_after_cm=None,
-            rotation_error_before_deg=None,
-            rotation_error_after_deg=None,
-            trajectory_before=centres,
-            c2w_before=before,
-        )
+        met, after = tuple(self.keyframes[i].frame for i in old), sum(result.losses.values())
+        return result.losses, loop_event(frame, met, before, self.trajectory[-1], result.loss_first, after, centres)
 
     def _optimise(
         self, window: NDArray[np.int64], iterations: int, interrupt: Interrupt | None, smooth: bool = False
@@ -304,17 +291,6 @@ class Slam:
         return self.mapper.field if self._pool is None else self.mapper.field.freeze()
 
     # ---- keyframes, box, views --------------------------------------------------------------------------------------
-
-    def _make_keyframe(self, frame: Frame) -> Keyframe:
-        count = max(64, round(self.config.keyframe_share * frame.depth.size))
-        rim = self.config.mapping.rim
-        pixels = choose_pixels(frame, self.intrinsics, count, self.config, self._rng, rim=rim)
-        if not self.config.sampling.without_depth:
-            pixels = pixels.take(np.flatnonzero(pixels.depth > 0))
-        return Keyframe(frame.index, pixels, make_thumbnail(frame.color))
-
-    def _add_keyframe(self, frame: Frame) -> None:
-        self.keyframes.append(self._make_keyframe(frame))
 
     def _grow_box(self) -> None:
         """Extend the scene box when over 1 % of the newest keyframe's points lie outside it."""
