@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ecslam.messages import RunTo
 from ecslam.types import InputError
 
 from . import theme
@@ -21,7 +20,7 @@ from .server import Dashboard, view
 
 DESKTOP, PHONE = (1440, 860), (390, 780)
 SETTLE_MS, MOST_LOOKS = 1500, 30
-COLORS = 160
+COLORS = 256
 STILL = 0.02  # mean change of grey values
 _MEANINGS = (theme.ESTIMATE, theme.TRUTH, theme.KEYFRAME, theme.WINDOW, theme.LOOP, theme.BEFORE, theme.OTHER)
 _KEPT_COLORS = ((255, 255, 255), (0, 0, 0), theme.ACCENT, *_MEANINGS, *(theme.paler(color) for color in _MEANINGS))
@@ -100,8 +99,6 @@ def _show_nothing(page: Any, dashboard: Dashboard) -> None:
 
 
 def _show_plots(page: Any, dashboard: Dashboard) -> None:
-    current = dashboard.hub.current
-    dashboard.engine.submit(RunTo(0 if current is None else int(0.8 * current.frames_total)))
     page.get_by_role("tab", name="Plots").click()
 
 
