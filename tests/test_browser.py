@@ -15,6 +15,9 @@ from ecslam_app.browser import PATIENCE_MS, dismiss_toasts, install_chromium, la
 from PIL import Image
 
 from ecslam import messages as m
+from ecslam.config import load_preset
+from ecslam.datasets import open_sequence
+from ecslam.runtime.engine import Engine
 from tests.fake_engine import FakeEngine, write_run
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -267,4 +270,39 @@ def test_usable_on_a_phone(tmp_path, browser):
         visit.page.close()
         dashboard.close()
         engine.stop()
+    assert visit.errors == []
+
+
+def test_the_engine_proper_is_watched_paused_stepped_and_taken_away(browser, tmp_path):
+    engine = Engine(load_preset("live"), open_sequence("synthetic/studio?size=160x120&frames=400"), tmp_path / "run")
+    dashboard = server.start(engine, port=0)
+    engine.start()
+    visit = Visit(browser, dashboard)
+    try:
+        visit.wait(lambda: visit.frame > 2)
+        visit.press("Pause")
+        visit.state("Paused")
+        before = visit.frame
+        visit.press("Step")
+        visit.wait(lambda: visit.frame == before + 1)
+        visit.state("Paused")
+        visit.tab("View")
+        visit.press("Off")
+        visit.wait(lambda: not dashboard.hub.scene._mesh_handle.visible)
+        bare = visit.pixels()
+        visit.press("Colour")
+        visit.wait(lambda: (np.abs(visit.pixels() - bare).max(-1) > 25).mean() > 0.03)
+        visit.tab("Export")
+        visit.download("Export mesh").save_as(tmp_path / "mesh.ply")
+        mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+        assert len(mesh.faces) > 1000
+        assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 100
+        visit.download("Export trajectory").save_as(tmp_path / "poses.txt")
+        assert len((tmp_path / "poses.txt").read_text().splitlines()) == before + 1 == visit.frame
+    finally:
+        visit.page.close()
+        engine.submit(m.Quit())
+        engine.join()
+        dashboard.close()
+    assert engine.error is None
     assert visit.errors == []
