@@ -80,7 +80,7 @@ def _camera(m: Mapping[str, Any], _: Values) -> bool:
     numbers = {"fov", "near", "far", "image_height", "image_width"}
     if set(m) != {*sizes, *numbers} or not all(_vector(m[k], n) for k, n in sizes.items()):
         return False
-    return all(_finite(m[k]) and m[k] >= 0 for k in numbers)
+    return all(_finite(m[k]) and m[k] >= (k.startswith("image_")) for k in numbers)
 
 
 def _click(m: Mapping[str, Any], _: Values) -> bool:

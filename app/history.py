@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,3 +67,13 @@ def discrepancy(s: Snapshot, most: int = 400) -> tuple[str, NDArray[np.float64],
         )
     frames = np.array([0, *(e.frame for e in s.loops), max(s.frame, 1)], float)
     return "Correction (cm)", frames, np.array([0.0, *(e.correction_cm for e in s.loops), 0.0])
+
+
+def with_last_mapping(s: Snapshot, last: Snapshot | None) -> Snapshot:
+    """A snapshot with the window and the time of the last mapping; ``last``: the snapshot before it.
+
+    Most frames are not mapped: without this the window would flicker away on every one of them.
+    """
+    if s.window or last is None or last.frame > s.frame or last.sequence != s.sequence:
+        return s
+    return replace(s, window=last.window, map_ms=last.map_ms)

@@ -33,7 +33,7 @@ from ecslam.runtime.protocol import EngineHandle
 
 from . import theme
 from .broadcast import downloading
-from .history import History
+from .history import History, with_last_mapping
 from .panel import TABS, BasePanel, find_panels
 from .replay import ReplayEngine
 from .scene import Scene
@@ -43,6 +43,7 @@ log = logging.getLogger(__name__)
 
 # Every viewer's socket must be written to, so more viewers get fewer updates and the engine keeps its pace.
 REFRESH_S, REFRESH_PER_VIEWER_S = 0.12, 0.01
+RESHAPED = 0.05
 TOAST_CHARACTERS, NOTICE_EVERY_S = 240, 2.0
 DOWNLOAD_LIMIT = 256 * 1024 * 1024
 
@@ -227,6 +228,7 @@ class Hub:
         if before is None or restarted or before.sequence != s.sequence:
             self._begin(s)
         self.history.add_snapshot(s)
+        s = self.current = with_last_mapping(s, before)
         with self.server.atomic():
             self.scene.update(s)
             for panel in self.panels:
@@ -278,7 +280,15 @@ class Hub:
     # ---- browsers ------------------------------------------------------------------------------------------------
 
     async def _connected(self, client: viser.ClientHandle) -> None:
+        aspect = client.camera.aspect
         self.post(partial(self.views.welcome, client))
+
+        @client.camera.on_update
+        async def _(camera: viser.CameraHandle) -> None:
+            nonlocal aspect
+            if abs(camera.aspect - aspect) > RESHAPED * aspect:
+                aspect = camera.aspect
+                self.post(partial(self.views.reshaped, client))
 
     def _keyframe_clicked(self, client: viser.ClientHandle, index: int) -> None:
         self.post(partial(self._visit, client, index))

@@ -43,6 +43,11 @@ def paler(color: RGB) -> RGB:
 STYLE = """
 [style*="letter-spacing"]{letter-spacing:normal!important}
 .mantine-Tabs-tab{padding:9px 10px;font-size:13px}
+.mantine-ScrollArea-scrollbar[data-orientation=vertical]{width:7px!important;padding:1px}
+[data-mantine-color-scheme=light] div[style*="background-color: rgb(255, 255, 255); overflow: hidden"]{
+  background:linear-gradient(#fdfdfe,#e8ecf1)!important}
+[data-mantine-color-scheme=dark] div[style*="background-color: rgb(20, 20, 20); overflow: hidden"]{
+  background:linear-gradient(#1a1d22,#0e1013)!important}
 .mantine-Button-root{border-radius:7px;font-weight:600}
 .mantine-Button-root[style*="gray-filled"]{--button-bg:transparent!important;--button-hover:rgba(128,128,128,.12)!important;
   --button-color:var(--mantine-color-text)!important;border:1px solid var(--mantine-color-default-border)}
@@ -75,7 +80,7 @@ STYLE = """
   border-bottom:1px solid var(--mantine-color-default-border)}
 .ec td:first-child,.ec th:first-child{text-align:left;color:var(--mantine-color-dimmed)}
 .ec th{font-weight:600}
-.ec-key{display:flex;flex-wrap:wrap;gap:3px 12px;font-size:11.5px;color:var(--mantine-color-dimmed)}
+.ec-key{display:flex;flex-wrap:wrap;gap:3px 10px;font-size:11.5px;color:var(--mantine-color-dimmed)}
 .ec-key i{display:inline-block;width:14px;height:3px;border-radius:2px;margin-right:5px;background:var(--c);
   vertical-align:middle}
 .ec-six{display:grid;grid-template-columns:1fr 1fr;gap:5px}

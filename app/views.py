@@ -29,6 +29,12 @@ class _Framing:
     look_at: Array
     until: float
 
+    def left(self, client: viser.ClientHandle) -> bool:
+        """Whether the viewer has taken the camera elsewhere."""
+        distance = np.linalg.norm(self.position - self.look_at)
+        moved = np.linalg.norm(client.camera.position - self.position)
+        return time.monotonic() >= self.until and bool(moved > MOVED * distance)
+
 
 class Views:
     """Moves viewers' cameras. Only the hub's thread calls these methods."""
@@ -56,15 +62,20 @@ class Views:
         clients = self._server.get_clients()
         self._framed = {k: framing for k, framing in self._framed.items() if k in clients}
         for number, framing in list(self._framed.items()):
-            client, settled = clients[number], time.monotonic() >= framing.until
-            distance = float(np.linalg.norm(framing.position - framing.look_at))
-            if settled and np.linalg.norm(client.camera.position - framing.position) > MOVED * distance:
+            client, distance = clients[number], np.linalg.norm(framing.position - framing.look_at)
+            if framing.left(client):
                 del self._framed[number]
                 continue
             position, look_at = self._all(client)
             away = max(np.linalg.norm(position - framing.position), np.linalg.norm(look_at - framing.look_at))
             if away > WORTH_A_MOVE * distance:
                 self.show_all(client, 2 * GLIDE_S)
+
+    def reshaped(self, client: viser.ClientHandle) -> None:
+        """A viewer's window has another shape: frame everything anew where the camera has been left to the page."""
+        framing = self._framed.get(client.client_id)
+        if framing is not None and not framing.left(client):
+            self.show_all(client, 0.0)
 
     def show(self, client: viser.ClientHandle, points: Array) -> None:
         """Bring points [n, 3] into one viewer's sight."""

@@ -57,6 +57,19 @@ def test_every_tab_has_a_panel_and_no_two_share_a_place():
         assert len(shown) == len(set(shown))
 
 
+def test_the_last_window_stays_on_the_page_between_two_mappings(engine, page):
+    mapped = replace(engine.skip_to(9).snapshot(), frame=10, window=(0, 5, 10), map_ms=80.0)
+    for s in (mapped, replace(mapped, frame=11, window=(), map_ms=0.0)):
+        page.hub._take(s)
+        assert until(lambda s=s: page.hub.current is not None and page.hub.current.frame == s.frame)
+    assert page.hub.current.window == (0, 5, 10)
+    assert page.hub.current.map_ms == 80.0
+    assert page.hub.history.series(["map_ms"])[1].tolist()[-1] == 0.0
+    page.hub._take(replace(mapped, frame=0, window=()))
+    assert until(lambda: page.hub.current.frame == 0)
+    assert page.hub.current.window == (), "a new run has had no mapping yet"
+
+
 class _Hub:
     def __init__(self, live):
         self.replay = None if live else type("Replay", (), {"others": (1,)})
@@ -98,7 +111,8 @@ def test_panels_and_scene_show_every_kind_of_snapshot(page, engine, caplog):
         page.hub.post(done.set)
         time.sleep(0.2)
         assert done.wait(2)
-        assert until(lambda s=s: page.hub.current is s)
+        same = ("trajectory", "trajectory_gt", "keyframes", "losses", "state")
+        assert until(lambda s=s: all(getattr(page.hub.current, name) is getattr(s, name) for name in same))
     assert "could not carry out" not in caplog.text
 
 

@@ -52,6 +52,13 @@ def test_a_growing_map_stays_in_sight(page, viewer):
     assert until(lambda: np.linalg.norm(client.camera.position) > 1.5 * np.linalg.norm(before))
 
 
+def test_another_shape_of_the_window_is_framed_anew(page, viewer):
+    connection, client = viewer
+    before = page.hub.views._framed[client.client_id].position
+    say(connection, "ViewerCameraMessage", **{**CAMERA, "position": before.tolist(), "image_width": 400})
+    assert until(lambda: np.linalg.norm(client.camera.position) > 1.1 * np.linalg.norm(before))
+
+
 def test_a_little_growth_moves_nobody(page, viewer):
     _, client = viewer
     before = np.array(client.camera.position)

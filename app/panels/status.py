@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from html import escape
 
 from ecslam.messages import Ack, Pause, Resume, Snapshot, State, Step, Stop
@@ -26,9 +25,9 @@ _LEGEND = theme.legend(
     [
         ("estimate", theme.ESTIMATE),
         ("ground truth", theme.TRUTH),
-        ("keyframes", theme.KEYFRAME),
-        ("BA window", theme.WINDOW),
-        ("loop closure", theme.LOOP),
+        ("keyframe", theme.KEYFRAME),
+        ("window", theme.WINDOW),
+        ("loop", theme.LOOP),
     ]
 )
 _COMING = {Pause: "Pausing …", Stop: "Stopping …", Step: "One step …", Resume: "Resuming …"}
@@ -41,31 +40,20 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
-        self._coming = ""
-        self._last: Snapshot | None = None
         self._html = hub.server.gui.add_html(render(None, ""))
 
     def snapshot(self, s: Snapshot) -> None:
-        self._coming = ""
-        # Most frames are not mapped: they show the last mapping's time and window instead of flickering to none.
-        self._last = _with_last_mapping(s, self._last)
-        self._html.content = render(self._last, "")
+        self._html.content = render(s, "")
 
     def ack(self, ack: Ack) -> None:
-        self._coming = _COMING.get(type(ack.command), "")
+        coming = _COMING.get(type(ack.command), "")
         settled = self.hub.current is not None and self.hub.current.state in (
             State.PAUSED,
             State.FINISHED,
             State.FAILED,
         )
-        if self._coming and not ack.error and not (settled and isinstance(ack.command, (Pause, Stop))):
-            self._html.content = render(self._last, self._coming)
-
-
-def _with_last_mapping(s: Snapshot, last: Snapshot | None) -> Snapshot:
-    if s.window or last is None or last.frame > s.frame:
-        return s
-    return replace(s, window=last.window, map_ms=last.map_ms)
+        if coming and not ack.error and not (settled and isinstance(ack.command, (Pause, Stop))):
+            self._html.content = render(self.hub.current, coming)
 
 
 def render(s: Snapshot | None, coming: str) -> str:
