@@ -139,7 +139,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class MeshReady:
-    """A mesh made from the field as it was at ``frame``."""
+    """A mesh made from the field as it was at ``frame``, or what the camera saw of the first one (``voxel_m`` 0)."""
 
     frame: int
     voxel_m: float

@@ -252,6 +252,8 @@ class Engine:
         return interrupt
 
     def _step(self, run: Run, item: tuple[int, Frame | FrameError], interrupt: Callable[[], None]) -> None:
+        if isinstance(item[1], Frame):
+            self._workshop.first_look(run, item[1])
         try:
             report = run.feed(*item, interrupt)
         except Abandoned:

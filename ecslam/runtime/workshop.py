@@ -5,13 +5,16 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from ..messages import Command, Export, Notice, RequestMesh, RequestPictures
-from ..types import InputError
+import numpy as np
+
+from ..messages import Command, Export, MeshReady, Notice, RequestMesh, RequestPictures
+from ..types import Frame, InputError
 from .control import Control
 from .exports import export_job, render_pictures
 from .feed import Feed
 from .mesh_files import mesh_bytes
 from .meshjobs import LIVE_POINTS, FrozenMap, JobThread, LiveMeshes, build_mesh
+from .preview import depth_mesh
 from .run import Run
 
 MESHES_KEPT = 8
@@ -64,9 +67,17 @@ class Workshop:
     def _mesh_job(self, frozen: FrozenMap, order: RequestMesh) -> Callable[[], None]:
         return lambda: self._feed.publish(build_mesh(frozen, order.voxel_m, order.max_triangles, self._leaving))
 
+    def first_look(self, run: Run, frame: Frame) -> None:
+        """What the camera measured in the run's first frame, for the watchers, until the map has learnt it."""
+        if self._feed.watched and run.slam is None:
+            config, c2w = run.config, np.eye(4) if frame.c2w_gt is None else frame.c2w_gt
+            mesh = depth_mesh(frame, run.plan.sequence.intrinsics, c2w, config.depth_near_m, config.depth_far_m)
+            self._feed.publish(MeshReady(frame.index, 0.0, mesh))
+
     def live(self, run: Run, at_once: bool = False) -> None:
-        """The periodic mesh, when somebody watches and it is due."""
-        frozen = run.freeze(LIVE_POINTS) if self._feed.watched and (at_once or self._live.due) else None
+        """The periodic mesh, when somebody watches and it is due; none before the map has learnt the first frame."""
+        wanted = self._feed.watched and bool(run.tally.rows) and (at_once or self._live.due)
+        frozen = run.freeze(LIVE_POINTS) if wanted else None
         if frozen is not None:
             self._live.begin()
             self._jobs.submit(lambda: self._make_live(self._live, frozen))
