@@ -224,5 +224,10 @@ def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
 
 
 def test_the_row_of_a_skipped_frame_is_the_one_before():
-    tally = Tally(position=7, rows=[1, 2, 5])
+    tally = Tally(position=7, rows=[1, 2, 5], skipped=4)
     assert tally.row_of_each_frame().tolist() == [0, 0, 1, 1, 1, 2, 2]
+
+
+def test_the_frame_at_work_has_no_pose_to_show():
+    tally = Tally(position=4, rows=[0, 2], skipped=1)
+    assert tally.row_of_each_frame().tolist() == [0, 0, 1]

@@ -15,7 +15,7 @@ from ..panel import BasePanel, put
 from .plots import Chart
 
 NONE = "None"
-AROUND = 1.35
+AROUND = 1.6
 
 
 class Panel(BasePanel):
@@ -71,7 +71,7 @@ class Panel(BasePanel):
 
 
 def _name(event: LoopEvent) -> str:
-    return f"Frame {event.frame + 1}: {event.correction_cm:.1f} cm"
+    return f"Frame {event.frame + 1}: {event.correction_cm:.2f} cm"
 
 
 def _intro() -> str:

@@ -44,7 +44,7 @@ class Panel(BasePanel):
             return
         due = time.monotonic() - self._asked > EVERY_S or s.state in (State.PAUSED, State.FINISHED)
         looked_at = self._live.value and not self._keyframe and bool(self.hub.server.get_clients())
-        if looked_at and due and s.frame != self._asked_frame:
+        if looked_at and due and s.keyframes and s.frame != self._asked_frame:
             self._asked, self._asked_frame = time.monotonic(), s.frame
             self.hub.submit(RequestPictures())
 

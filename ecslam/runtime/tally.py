@@ -65,8 +65,12 @@ class Tally:
         return 1e3 * (len(self.rows) - 1) / self.engine_ms if self.engine_ms > 0 else 0.0
 
     def row_of_each_frame(self) -> np.ndarray[Any, np.dtype[np.int64]]:
-        """[position] for every frame so far the row of the trajectory that holds its pose or the last one before it."""
-        rows = np.searchsorted(np.array(self.rows, np.int64), np.arange(self.position), side="right") - 1
+        """[n] for every frame so far the row of the trajectory that holds its pose or the last one before it.
+
+        A frame that is still at work has no pose yet and is left out.
+        """
+        done = np.arange(len(self.rows) + self.skipped)
+        rows = np.searchsorted(np.array(self.rows, np.int64), done, side="right") - 1
         return rows.clip(0)
 
     def to_json(self) -> dict[str, Any]:
