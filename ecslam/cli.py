@@ -205,6 +205,25 @@ def bench_speed(
         plot_speed(result, plot)
 
 
+@bench.command(name="viewers")
+def bench_viewers(
+    sequence: SequenceArgument = "synthetic/studio",
+    preset: Annotated[str, typer.Option(help="Preset, or a YAML file.")] = "live",
+    frames: Frames = "",
+    viewers: Annotated[int, typer.Option(min=1, max=200, help="How many pages are open at once.")] = 20,
+    pairs: Annotated[int, typer.Option(min=1, help="Comparisons at most; the median is printed.")] = 5,
+    device: Device = "auto",
+    json: Annotated[Path | None, typer.Option(help="Write every figure to this file.")] = None,
+) -> None:
+    """Frames per second with many open pages against none, in turn within one run."""
+    from . import commands
+    from .bench.viewers import print_result
+
+    result = commands.bench_viewers(sequence, preset, frames, viewers, pairs, commands.pick_device(device))
+    print_result(result)
+    commands.write_json(json, result)
+
+
 @bench.command(name="accuracy")
 def bench_accuracy(
     sequence: SequenceArgument = "synthetic/studio",

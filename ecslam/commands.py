@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
 import threading
 import webbrowser
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from . import datasets
 from .config import Config
 from .evaluation.trajectory_io import read_tum
-from .messages import Snapshot, State
+from .messages import Quit, Snapshot, State
 from .runtime.checkpoint import load_checkpoint
 from .runtime.driven import import_slam
 from .runtime.engine import Engine
@@ -137,6 +138,26 @@ def view(folders: list[Path], host: str, port: int, browser: bool) -> None:
         threading.Event().wait()
     except KeyboardInterrupt:
         dashboard.close()
+
+
+def bench_viewers(address: str, preset: str, frames: str, viewers: int, pairs: int, device: str) -> dict[str, Any]:
+    """Run under the dashboard in a temporary folder, in turn without viewers and with them. See ``bench.viewers``."""
+    from ecslam_app import server
+    from ecslam_app.readers import crowd
+
+    from .bench.runs import preset_config
+    from .bench.viewers import measure
+
+    opened = open_sequence(address)
+    with tempfile.TemporaryDirectory(prefix="ecslam-bench-") as parent:
+        engine = Engine(preset_config(preset, opened), opened, Path(parent) / "run", device=device, frames=frames)
+        dashboard = server.start(engine, port=0)
+        try:
+            return measure(engine, lambda: crowd(dashboard, viewers), viewers, pairs)
+        finally:
+            engine.submit(Quit())
+            engine.join()
+            dashboard.close()
 
 
 class Reports:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import struct
-import subprocess
-import sys
 import time
 from pathlib import Path
 from statistics import median
@@ -14,13 +11,13 @@ from statistics import median
 import msgspec
 import numpy as np
 import pytest
-import viser
 import zstandard
 from ecslam_app import broadcast, front, server
+from ecslam_app.readers import crowd, greeting
 from viser._messages import SceneNodeUpdateMessage
 
 from tests.fake_engine import FakeEngine
-from tests.test_app_security import CAMERA, until
+from tests.test_app_security import until
 
 MB = 1024 * 1024
 
@@ -40,22 +37,6 @@ def memory():
 
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads the memory's size from /proc")
-
-
-def greeting(port):
-    """What a browser says first: the upgrade, and its camera as one masked binary frame."""
-    host = f"127.0.0.1:{port}"
-    body = msgspec.msgpack.encode({"type": "ViewerCameraMessage", **CAMERA})
-    return (
-        (
-            f"GET / HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\nUpgrade: websocket\r\n"
-            f"Connection: Upgrade\r\nSec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Version: 13\r\n"
-            f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n"
-        ).encode()
-        + b"\x82\xfe"
-        + struct.pack(">HI", len(body), 0)
-        + body
-    )
 
 
 def unpack(data):
@@ -93,22 +74,6 @@ def test_viewers_in_step_get_the_same_bytes_and_others_their_own():
         assert unpack(packer.shared(batch(value)))[1] == [value.tobytes()]
 
 
-READERS = """
-import asyncio, sys
-port, count, hello = int(sys.argv[1]), int(sys.argv[2]), bytes.fromhex(sys.argv[3])
-class Reader(asyncio.BufferedProtocol):
-    room = bytearray(1 << 20)
-    def connection_made(self, transport): transport.write(hello)
-    def get_buffer(self, hint): return self.room
-    def buffer_updated(self, count): pass
-async def main():
-    loop = asyncio.get_running_loop()
-    for _ in range(count): await loop.create_connection(Reader, "127.0.0.1", port)
-    await loop.run_in_executor(None, sys.stdin.read)
-asyncio.run(main())
-"""
-
-
 @pytest.mark.slow
 def test_twenty_viewers_cost_one_packing(tmp_path, monkeypatch):
     """All are served, from about one packing a batch. The engine's rate with and without them is printed, not asserted.
@@ -132,9 +97,7 @@ def test_twenty_viewers_cost_one_packing(tmp_path, monkeypatch):
         assert until(lambda: engine.latest() is not None)
         for _ in range(3):
             alone.append(rate())
-            arguments = [sys.executable, "-c", READERS, str(page.port), "20", greeting(page.port).hex()]
-            with subprocess.Popen(arguments, stdin=subprocess.PIPE) as readers:
-                assert until(lambda: len(list(page.hub.viewers())) == 20, 60)
+            with crowd(page, 20):
                 time.sleep(0.5)
                 made.clear()
                 sent.clear()
@@ -142,8 +105,6 @@ def test_twenty_viewers_cost_one_packing(tmp_path, monkeypatch):
                 assert len(list(page.hub.viewers())) == 20
                 assert len(sent) > 20
                 assert len(made) < 0.4 * len(sent)
-                readers.stdin.close()
-            assert until(lambda: not list(page.hub.viewers()), 30)
     finally:
         page.close()
         engine.stop()
