@@ -6,18 +6,22 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from .se3 import rotation_angle_deg
+from .align import Surface
+from .se3 import retract, rotation_angle_deg
 from .tracker import TrackResult
 
 LOST_FIT = 0.25
-LOST_SHARE, FOUND_SHARE = 0.6, 0.85  # of the usual fit: a wrong place still explains up to three quarters
+LOST_SHARE, FOUND_SHARE = 0.6, 0.92  # of the usual fit: a wrong place can be made to explain 85 % of it
 USUAL_OVER = 10
 FOUND_FIT = 0.6
 PATIENCE = 3
 MAX_STEP_M = 0.5
 MAX_TURN_DEG = 35.0
+SEARCH_POINTS, SEARCH_POSES, SEARCH_KEPT, SEARCH_FOUND, SEARCH_ROUNDS = 300, 600, 30, 3, 5
+SEARCH_M, SEARCH_RAD = 0.2, 0.25
 
 
 class Recovery:
@@ -62,3 +66,34 @@ def best_start(
 ) -> TrackResult:
     """Track from every start pose [4, 4] and keep the result that the map explains best."""
     return max((track(start) for start in starts), key=lambda result: result.fit)
+
+
+def search(
+    surface: Surface,
+    points: NDArray[np.float32],
+    starts: NDArray[np.float64],
+    truncation_m: float,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """The few poses [k, 4, 4] around ``starts`` [S, 4, 4] that bring measured points [N, 3], in camera coordinates,
+    nearest to the known surface: random ones, then nearer and nearer around the best (the cross-entropy method)."""
+    points = points[:: max(1, len(points) // SEARCH_POINTS)]
+    best = starts[np.arange(SEARCH_POSES) % len(starts)]
+    spread = np.array([SEARCH_M] * 3 + [SEARCH_RAD] * 3)
+    for _ in range(SEARCH_ROUNDS):
+        moves = torch.from_numpy(rng.normal(size=(len(best), 6)) * spread)
+        poses = np.concatenate([best, retract(torch.from_numpy(best), moves).numpy()])
+        ranked = poses[np.argsort(-_nearness(surface, points, poses, truncation_m), kind="stable")]
+        best = ranked[np.arange(SEARCH_POSES) % SEARCH_KEPT]
+        spread = spread / 2
+    return ranked[:SEARCH_FOUND]
+
+
+def _nearness(
+    surface: Surface, points: NDArray[np.float32], poses: NDArray[np.float64], truncation_m: float
+) -> NDArray[np.float64]:
+    """[P] mean over the points of 1 on the surface, falling to 0 at ``truncation_m`` and where nothing is known."""
+    world = np.einsum("pij,nj->pni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    distance, known = surface.distances(world.reshape(-1, 3))
+    near = np.where(known, np.maximum(0.0, 1 - np.abs(distance) / truncation_m), 0.0)
+    return np.asarray(near.reshape(len(poses), -1).mean(1))

@@ -25,7 +25,7 @@ from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
 from .observed import ObservedVoxels
 from .pixels import Pixels, choose_pixels, spread_pixels
-from .recovery import Recovery, best_start
+from .recovery import Recovery, best_start, search
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .se3 import retract
 from .tracker import TrackResult, fit, track_adam, track_direct
@@ -227,12 +227,15 @@ class Slam:
             self._volume.integrate(frame, self.intrinsics, self.trajectory[-1], near, far)
 
     def _relocalise(self, frame: Frame, measured: Pixels) -> TrackResult:
-        """Direct alignment with a wide basin from the last pose and from the keyframes that look most alike."""
-        poses = self.trajectory.keyframe_poses()
+        """Direct alignment with a wide basin from the last pose, the keyframes that look most alike, and the poses that
+        a search around these finds."""
+        poses, surface = self.trajectory.keyframe_poses(), self._surface()
         alike = most_similar(self.keyframes, make_thumbnail(frame.color), RELOCALISE_FROM)
         wide = replace(self.config, align=replace(self.config.align, kernels_m=RELOCALISE_KERNELS_M, iterations=20))
-        starts = [self.trajectory[-1], *(poses[i] for i in alike)]
-        return best_start(lambda start: track_direct(self._surface(), measured, start, wide), starts)
+        starts = np.stack([self.trajectory[-1], *(poses[i] for i in alike)])
+        rng = np.random.default_rng([self.config.seed, frame.index])
+        found = search(surface, measured.points(), starts, self.config.truncation_m, rng)
+        return best_start(lambda start: track_direct(surface, measured, start, wide), [*starts, *found])
 
     # ---- mapping ----------------------------------------------------------------------------------------------------
 

@@ -157,3 +157,13 @@ def test_after_a_gap_of_over_a_second_the_search_is_wider():
     report = slam.step(replace(ROOM[23], index=20, timestamp=19 / 30 + 1.2))
     assert report.tracked
     assert error_cm(slam, 23) < 3
+
+
+@pytest.mark.slow
+def test_a_camera_that_comes_back_elsewhere_than_it_was_lost_is_found():
+    slam = engine()
+    walk(slam, list(range(16)))
+    walk(slam, [15] * 5, blind)
+    (back,) = walk(slam, [30])  # 29 cm and 18 degrees from the last frame seen
+    assert back.note == "relocalised"
+    assert error_cm(slam, 30) < 3
