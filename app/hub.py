@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
 REFRESH_S, REFRESH_PER_VIEWER_S = 0.12, 0.01
 RESHAPED = 0.05
 TOAST_CHARACTERS, NOTICE_EVERY_S = 240, 2.0
+LONGEST_JOB_S = 120.0
 DOWNLOAD_LIMIT = 256 * 1024 * 1024
 
 
@@ -61,6 +62,7 @@ class Hub:
         self.follow = False
         self.jobs = ThreadPoolExecutor(2, "dashboard-job")
         self._askers: dict[int, viser.ClientHandle] = {}
+        self._under_way: dict[int, viser.NotificationHandle] = {}
         self._asking = threading.Lock()
         self._inbox: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._subscription = engine.subscribe()
@@ -158,6 +160,10 @@ class Hub:
         for viewer in [client] if client is not None else self.viewers():
             viewer.add_notification(title, brief, auto_close_seconds=8.0, color=color)  # type: ignore[call-overload]
 
+    def under_way(self, text: str, client: viser.ClientHandle) -> viser.NotificationHandle:
+        """Tell a viewer that something has begun; ``remove`` what comes back when it is done."""
+        return client.add_notification("Working", text, loading=True, auto_close_seconds=LONGEST_JOB_S)
+
     def deliver(self, client: viser.ClientHandle | None, path: Path) -> None:
         """Say where a file lies and start its download in the browser of who asked for it."""
         size = path.stat().st_size
@@ -253,13 +259,19 @@ class Hub:
             self.scene.set_mesh(message)
             self.views.keep_framed()
         elif isinstance(message, Exported):
-            self.jobs.submit(self.deliver, self._askers.pop(message.command_id or -1, None), Path(message.path))
+            self._exported(message.command_id or -1, Path(message.path))
         elif isinstance(message, Notice):
             self._notice(message)
         elif isinstance(message, LoopEvent):
             self.toast("Loop closed", f"Frame {message.frame + 1}: corrected by {message.correction_cm:.1f} cm", "teal")
         for panel in self.panels:
             panel.event(message)
+
+    def _exported(self, command_id: int, path: Path) -> None:
+        asker, note = self._askers.pop(command_id, None), self._under_way.pop(command_id, None)
+        if note is not None:
+            note.remove()
+        self.jobs.submit(self.deliver, asker, path)
 
     def _notice(self, notice: Notice) -> None:
         now = time.monotonic()
@@ -271,7 +283,10 @@ class Hub:
     def _acknowledged(self, ack: Ack) -> None:
         with self._asking:
             waits = isinstance(ack.command, Export) and not ack.error
-            asker = None if waits else self._askers.pop(ack.command_id, None)
+            asker = self._askers.get(ack.command_id) if waits else self._askers.pop(ack.command_id, None)
+        if isinstance(ack.command, Export) and waits and asker is not None:
+            text = f"Writing the {ack.command.kind}; the download starts by itself"
+            self._under_way[ack.command_id] = self.under_way(text, asker)
         if ack.error:
             self.toast("Not done", ack.error, "red", asker)
         for panel in self.panels:

@@ -193,6 +193,8 @@ class Scene:
         others = poses[~chosen] if self._inspected is None else poses[:0]
         for name, some in (("all", others), ("window", poses[chosen])):
             self._lines[f"keyframes/{name}"].points = frustum_lines(some, s.fov_y_rad, s.aspect, FRUSTUM_M)
+        if self._frusta is not None:
+            self._frusta.visible = len(poses) > 0 and self._keyframes_wanted and self._inspected is None
         if len(poses) == 0:
             return
         colors = np.where(chosen[:, None], theme.WINDOW, theme.KEYFRAME).astype(np.uint8)
@@ -216,13 +218,14 @@ class Scene:
             self._frusta.batched_wxyzs = wxyz(poses).astype(np.float32)
             self._frusta.batched_positions = poses[:, :3, 3].astype(np.float32)
             self._frusta.batched_colors = colors
-        self._frusta.visible = self._keyframes_wanted and self._inspected is None
 
     async def _clicked(self, event: Any) -> None:
         if event.instance_index is not None and self._on_keyframe is not None:
             self._on_keyframe(event.client, int(event.instance_index))
 
     def _draw_camera(self, s: Snapshot) -> None:
+        if self._camera is not None:
+            self._camera.visible = len(s.trajectory) > 0
         if len(s.trajectory) == 0:
             return
         at = len(s.trajectory) - 1 if self._inspected is None else min(self._inspected.frame, len(s.trajectory) - 1)

@@ -14,6 +14,7 @@ from ecslam_app import server
 from ecslam_app.panel import TABS, BasePanel, find_panels
 from ecslam_app.panels.status import WORDS, render
 
+from ecslam import config as configuration
 from ecslam import messages as m
 from tests.fake_engine import FakeEngine, write_run
 from tests.test_app_security import control, dial, enter, press, until
@@ -70,6 +71,56 @@ def test_the_last_window_stays_on_the_page_between_two_mappings(engine, page):
     assert page.hub.current.window == (), "a new run has had no mapping yet"
 
 
+def test_a_halt_is_announced_until_it_has_come_about(engine, page):
+    status, moving = page.hub.panels[0], engine.skip_to(9).snapshot()
+    page.hub.current = moving = replace(moving, state=m.State.TRACKING)
+    status.ack(m.Ack(1, m.Pause()))
+    assert "Pausing" in status._html.content
+    status.snapshot(replace(moving, frame=10))
+    assert "Pausing" in status._html.content
+    status.snapshot(replace(moving, frame=11, state=m.State.PAUSED))
+    assert "Paused" in status._html.content
+    status.ack(m.Ack(2, m.Resume()))
+    assert "Resuming" in status._html.content
+    status.snapshot(replace(moving, frame=12))
+    assert "Resuming" not in status._html.content
+    status.ack(m.Ack(3, m.Pause(), "the run is over"))
+    assert "Pausing" not in status._html.content
+
+
+def test_a_new_run_hides_what_the_last_one_drew(engine, page):
+    scene, s = page.hub.scene, engine.skip_to(20).snapshot()
+    scene.update(s)
+    assert scene._camera.visible
+    assert scene._frusta.visible
+    empty = replace(s, frame=0, trajectory=s.trajectory[:0], keyframes=(), window=(), loops=())
+    scene.begin(empty)
+    scene.update(empty)
+    assert not scene._camera.visible
+    assert not scene._frusta.visible
+    scene.update(s)
+    assert scene._camera.visible
+    assert scene._frusta.visible
+
+
+def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
+    engine = FakeEngine(tmp_path / "run", frames=60)
+    engine.run_folder.mkdir()
+    config = configuration.load_preset("live")
+    settings = ["seed=7", "schedule=overlap", "mapping.iterations=23"]
+    (engine.run_folder / "config.yaml").write_text(
+        configuration.to_yaml(configuration.apply_settings(config, settings))
+    )
+    engine._preset = "live"
+    page = server.start(engine.skip_to(3), port=0)
+    try:
+        wanted = {"Seed": 7, "Schedule": "overlap", "Tracking iterations": 0, "Mapping iterations": 23}
+        for label, value in wanted.items():
+            assert until(lambda label=label, value=value: control(page, label)[1].value == value), label
+    finally:
+        page.close()
+
+
 class _Hub:
     def __init__(self, live):
         self.replay = None if live else type("Replay", (), {"others": (1,)})
@@ -103,7 +154,7 @@ def odd_snapshots(engine):
 
 
 def test_panels_and_scene_show_every_kind_of_snapshot(page, engine, caplog):
-    odd = list(odd_snapshots(engine))
+    odd, same = list(odd_snapshots(engine)), ("trajectory", "trajectory_gt", "keyframes", "losses", "state")
     assert until(lambda: page.hub.current is engine.latest())
     for s in odd:
         done = threading.Event()
@@ -111,7 +162,6 @@ def test_panels_and_scene_show_every_kind_of_snapshot(page, engine, caplog):
         page.hub.post(done.set)
         time.sleep(0.2)
         assert done.wait(2)
-        same = ("trajectory", "trajectory_gt", "keyframes", "losses", "state")
         assert until(lambda s=s: all(getattr(page.hub.current, name) is getattr(s, name) for name in same))
     assert "could not carry out" not in caplog.text
 

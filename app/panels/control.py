@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from ecslam.config import load_preset
+from ecslam.config import Config, load_config, load_preset
 from ecslam.messages import (
     Command,
     LoadPreset,
@@ -40,9 +40,9 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
-        self._shown_sequence, self._shown_preset = "", ""
+        self._shown_preset = ""
         gui = hub.server.gui
-        verbs = gui.add_button_group("Run", tuple(_VERBS))
+        verbs = gui.add_button_group("Run", tuple(_VERBS), hint="Space pauses and resumes, n goes one step")
         hub.commands(verbs, lambda: _VERBS[verbs.value])
         self._until = gui.add_number(
             "Frame", 1, min=1, max=1_000_000, step=1, hint="Go on until this frame, then pause"
@@ -60,9 +60,6 @@ class Panel(BasePanel):
             put(self._until, max(1, s.frames_total // 2))
         if s.preset != self._shown_preset:
             self._show_preset(s.preset)
-        if self._sequence.value != s.sequence and not self._shown_sequence and s.sequence in self._sequence.options:
-            put(self._sequence, s.sequence)
-        self._shown_sequence = s.sequence
 
     def _hot_keys(self) -> None:
         gui = self.hub.server.gui
@@ -80,19 +77,20 @@ class Panel(BasePanel):
 
     def _start_over(self) -> None:
         gui, engine = self.hub.server.gui, self.hub.engine
-        current = engine.latest()
+        current, given = engine.latest(), self._given()
         sequences = engine.sequences or ("synthetic/studio",)
         presets = engine.presets or ("lite",)
         with gui.add_folder("Start over"):
-            self._sequence = gui.add_dropdown(
-                "Sequence", sequences, initial_value=_choose(current.sequence if current else "", sequences)
-            )
+            self._sequence = gui.add_dropdown("Sequence", sequences)
             self._preset = gui.add_dropdown(
                 "Preset", presets, initial_value=_choose(current.preset if current else "lite", presets)
             )
-            self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
+            self._seed = gui.add_number("Seed", given.seed, min=0, max=2**31 - 1, step=1)
             self._schedule = gui.add_dropdown(
-                "Schedule", SCHEDULES, hint="strict: repeatable; overlap: mapping in parallel"
+                "Schedule",
+                SCHEDULES,
+                initial_value=given.schedule,
+                hint="strict: repeatable; overlap: mapping in parallel",
             )
             self.hub.commands(gui.add_button("Restart", color="orange"), self._restart)
             self.hub.commands(
@@ -109,10 +107,10 @@ class Panel(BasePanel):
         gui = self.hub.server.gui
         with gui.add_folder("Live parameters", expand_by_default=False):
             self._iterations = {
-                key: gui.add_slider(label, 1, 60, 1, 10)
-                for key, label in (
-                    ("tracking.iterations", "Tracking iterations"),
-                    ("mapping.iterations", "Mapping iterations"),
+                key: gui.add_slider(label, fewest, 60, 1, 10)
+                for key, label, fewest in (
+                    ("tracking.iterations", "Tracking iterations", 0),
+                    ("mapping.iterations", "Mapping iterations", 1),
                 )
             }
         for key, slider in self._iterations.items():
@@ -122,15 +120,27 @@ class Panel(BasePanel):
         self.hub.submit(Tune(key, int(event.target.value)), event.client)
 
     def _show_preset(self, name: str) -> None:
-        self._shown_preset = name
+        first, self._shown_preset = not self._shown_preset, name
         if name in self._preset.options:
             put(self._preset, name)
-        try:
-            config = load_preset(name)
-        except InputError:
-            return
+        config = self._given() if first else _preset(name)
         for key, slider in self._iterations.items():
-            put(slider, min(getattr(config, key.split(".")[0]).iterations, int(slider.max)))
+            iterations = getattr(config, key.split(".")[0]).iterations
+            put(slider, min(max(iterations, int(slider.min)), int(slider.max)))
+
+    def _given(self) -> Config:
+        """What the run was started with: its preset and whatever was laid over it."""
+        try:
+            return load_config(self.hub.engine.run_folder / "config.yaml")
+        except InputError:
+            return Config()
+
+
+def _preset(name: str) -> Config:
+    try:
+        return load_preset(name)
+    except InputError:
+        return Config()
 
 
 def _choose(wanted: str, options: tuple[str, ...]) -> str:

@@ -57,13 +57,19 @@ class Panel(BasePanel):
     def _later(self, job: Any) -> Any:
         """An action that runs ``job(client)`` aside and delivers the file it returns."""
 
-        def run(client: Any) -> None:
+        def run(client: Any, note: Any) -> None:
             try:
                 self.hub.deliver(client, job(client))
             except (OSError, RuntimeError, TimeoutError) as error:
                 self.hub.toast("Not saved", str(error), "red", client)
+            finally:
+                note.remove()
 
-        return lambda event: self.hub.jobs.submit(run, event.client)
+        def begin(event: Any) -> None:
+            note = self.hub.under_way(f"{event.target.label} …", event.client)
+            self.hub.jobs.submit(run, event.client, note)
+
+        return begin
 
     def _path(self, name: str) -> Path:
         folder = self.hub.engine.run_folder / "exports"

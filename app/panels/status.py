@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from ecslam.messages import Ack, Pause, Resume, Snapshot, State, Step, Stop
+from ecslam.messages import Ack, Command, LoadPreset, Pause, Restart, Resume, RunTo, Snapshot, State, Step, Stop
 
 from .. import theme
 from ..hub import Hub
@@ -30,7 +30,16 @@ _LEGEND = theme.legend(
         ("loop", theme.LOOP),
     ]
 )
-_COMING = {Pause: "Pausing …", Stop: "Stopping …", Step: "One step …", Resume: "Resuming …"}
+_COMING = {
+    Pause: "Pausing …",
+    Stop: "Stopping …",
+    Step: "One step …",
+    Resume: "Resuming …",
+    RunTo: "Running on …",
+    Restart: "Restarting …",
+    LoadPreset: "Changing preset …",
+}
+_SETTLED = (State.PAUSED, State.FINISHED, State.FAILED)
 
 
 class Panel(BasePanel):
@@ -40,20 +49,23 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
+        self._halting: Command | None = None
         self._html = hub.server.gui.add_html(render(None, ""))
 
     def snapshot(self, s: Snapshot) -> None:
-        self._html.content = render(s, "")
+        if s.state in _SETTLED:
+            self._halting = None
+        self._html.content = render(s, _COMING[type(self._halting)] if self._halting else "")
 
     def ack(self, ack: Ack) -> None:
-        coming = _COMING.get(type(ack.command), "")
-        settled = self.hub.current is not None and self.hub.current.state in (
-            State.PAUSED,
-            State.FINISHED,
-            State.FAILED,
-        )
-        if coming and not ack.error and not (settled and isinstance(ack.command, (Pause, Stop))):
-            self._html.content = render(self.hub.current, coming)
+        """Answer at once; a halt that waits for the frame at work keeps its word until it has come about."""
+        if ack.error or type(ack.command) not in _COMING:
+            return
+        halts = isinstance(ack.command, (Pause, Stop))
+        if halts and self.hub.current is not None and self.hub.current.state in _SETTLED:
+            return
+        self._halting = ack.command if halts else None
+        self._html.content = render(self.hub.current, _COMING[type(ack.command)])
 
 
 def render(s: Snapshot | None, coming: str) -> str:

@@ -111,8 +111,10 @@ class Control:
             self._restart = command
             self._leave_at = 0.0
         elif isinstance(command, (LoadPreset, Tune)):
+            self._require_run()
             self.config = self._tuned(command)
             self._work.append((command_id, command))
+            self._announced = self._announced and isinstance(command, Tune)
         elif isinstance(command, SpeedLimit):
             if not 0 <= command.frames_per_s < math.inf:
                 raise InputError(
@@ -134,21 +136,26 @@ class Control:
             self._changed.notify_all()
 
     def _steer(self, command: Pause | Resume | Step | RunTo | Stop) -> None:
-        if self.over:
-            raise InputError("the run is over; restart it")
+        self._require_run()
         if isinstance(command, Stop):
             self._stop = True
             self._leave_at = min(self._leave_at, monotonic() + GRACE_S)
         elif isinstance(command, RunTo):
             if not self.position <= command.frame < self._total:
-                raise InputError(
-                    f"cannot run to frame {command.frame}; it must lie in {self.position} .. {self._total - 1}"
-                )
+                raise InputError(f"cannot run to frame {command.frame + 1}; {self._ahead()}")
             self._paused, self._pause_at = False, command.frame + 1
         else:
             self._paused = isinstance(command, Pause)
             self._pause_at = self.position + 1 if isinstance(command, Step) else None
         self._announced = self._announced and self._paused
+
+    def _require_run(self) -> None:
+        if self.over:
+            raise InputError("the run is over; restart it")
+
+    def _ahead(self) -> str:
+        """Which frames are to come, counted from 1."""
+        return f"{self.position + 1} .. {self._total} lie ahead" if self.position < self._total else "none lies ahead"
 
     def _enqueue(self, command_id: int, command: RequestMesh | RequestPictures | Export) -> None:
         if isinstance(command, Export) and command.format not in ("", *EXPORTS.get(command.kind, ())):
