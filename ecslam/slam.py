@@ -40,6 +40,7 @@ LEAST_POINTS = 64
 WORSE = 1.02  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
 RELOCALISE_FROM = 5
 GAP_S = 1.0
+OUTSIDE_SHARE = 0.01
 AROUND_M, AROUND_RAD = 0.1, 0.1
 RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
 SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
@@ -80,7 +81,7 @@ class Slam:
         self._pending: Future[MapResult] | None = None
         self._window: NDArray[np.int64] = np.empty(0, np.int64)
         self._frozen: TsdfField | None = None
-        self._note = ""
+        self._note, self._outside = "", 0.0
 
     # ---- one frame --------------------------------------------------------------------------------------------------
 
@@ -296,13 +297,17 @@ class Slam:
     # ---- keyframes, box, views --------------------------------------------------------------------------------------
 
     def _grow_box(self) -> None:
-        """Extend the scene box when over 1 % of the newest keyframe's points lie outside it."""
+        """Extend the scene box when over 1 % of the newest keyframe's points lie outside it; one from the configuration
+        stays, and a note says how many."""
         assert self.mapper is not None
         points = _world(self.keyframes[-1].pixels, self.trajectory[-1])
         low, high = self.mapper.field.layout.box.numpy()
         outside = ((points < low) | (points > high)).any(1).mean() if len(points) else 0.0
-        if self.config.field.box is None and outside > 0.01:
+        if self.config.field.box is None and outside > OUTSIDE_SHARE:
             self.mapper.grow(box_of_points(points, self.config.field.box_margin_m))
+        elif outside > max(OUTSIDE_SHARE, 2 * self._outside):
+            self._outside = outside
+            self._note = f"{outside:.0%} of the rays end outside field.box and are not mapped; widen it or leave it out"
 
     def surface_points(self, limit: int) -> NDArray[np.float32]:
         """Measured points [N, 3] of all keyframes in the world, where the map has been observed: about ``limit`` of

@@ -167,3 +167,32 @@ def test_a_camera_that_comes_back_elsewhere_than_it_was_lost_is_found():
     (back,) = walk(slam, [30])  # 29 cm and 18 degrees from the last frame seen
     assert back.note == "relocalised"
     assert error_cm(slam, 30) < 3
+
+
+def test_a_fixed_box_that_is_too_small_is_said_with_the_share_of_rays_outside():
+    slam = engine(live("mapping.first_iterations=1", "field.box=[2, 0, 0, 4, 6, 3]"))
+    reports = walk(slam, list(range(11)))
+    notes = [r.note for r in reports if r.note]
+    assert len(notes) == 1
+    share = float(notes[0].partition("%")[0])
+    assert "outside field.box" in notes[0]
+    assert 2 < share < 100
+    assert slam.field is not None
+    assert slam.field.layout.box.numpy().tolist() == [[2, 0, 0], [4, 6, 3]]
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_depth_that_is_not_finite_or_out_of_range_is_none():
+    def spoil(frame: Frame) -> Frame:
+        depth = frame.depth.copy()
+        for row, value in zip((0, 20, 40, 50, 60), (np.nan, np.inf, 65.535, 0.0, -1.0), strict=True):
+            depth[row : row + 10] = value
+        return replace(frame, depth=depth)
+
+    slam = engine(live("mapping.first_iterations=5"))
+    reports = walk(slam, list(range(7)), spoil)
+    assert all(r.tracked for r in reports)
+    assert error_cm(slam, 6) < 3
+    assert all(np.isfinite(value).all() for value in slam.state().values() if value.dtype.kind == "f")
+    points = slam.surface_points(100_000)
+    assert (np.linalg.norm(points - slam.trajectory[-1][:3, 3], axis=1) < 9).all()
