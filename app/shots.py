@@ -20,7 +20,7 @@ from .server import Dashboard, view
 
 DESKTOP, PHONE = (1440, 860), (390, 780)
 SETTLE_MS, MOST_LOOKS = 1500, 30
-COLORS = 256
+COLORS, FLAT = 256, 48
 STILL = 0.02  # mean change of grey values
 _MEANINGS = (theme.ESTIMATE, theme.TRUTH, theme.KEYFRAME, theme.WINDOW, theme.LOOP, theme.BEFORE, theme.OTHER)
 _KEPT_COLORS = ((255, 255, 255), (0, 0, 0), theme.ACCENT, *_MEANINGS, *(theme.paler(color) for color in _MEANINGS))
@@ -83,12 +83,17 @@ def _still(page: Any) -> bytes:
 
 
 def few_colors(png: bytes) -> bytes:
-    """A screenshot as a PNG of few colours, a third of its size: those it has most of, and all that carry meaning."""
+    """A screenshot as a PNG of few colours, a third of its size.
+
+    They are all that carry meaning, those that fill flat areas, and a choice that stands for the rest.
+    """
     picture = Image.open(io.BytesIO(png)).convert("RGB")
-    count = COLORS - len(_KEPT_COLORS)
+    colors, counts = np.unique(np.asarray(picture).reshape(-1, 3), axis=0, return_counts=True)
+    exact = [*_KEPT_COLORS, *colors[np.argsort(-counts, kind="stable")[:FLAT]].tolist()]
+    count = COLORS - len(exact)
     common = picture.quantize(count, method=Image.Quantize.MEDIANCUT).getpalette() or []
     palette = Image.new("P", (1, 1))
-    palette.putpalette([*(value for color in _KEPT_COLORS for value in color), *common[: 3 * count]])
+    palette.putpalette([*(value for color in exact for value in color), *common[: 3 * count]])
     out = io.BytesIO()
     picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(out, "png", optimize=True)
     return out.getvalue()
