@@ -101,6 +101,7 @@ def demo(
 @app.command()
 def resume(
     folder: RunFolder,
+    sequence: Annotated[str | None, typer.Option(help="Where the sequence lies now, if it has moved.")] = None,
     device: Device = "auto",
     headless: Headless = False,
     host: Host = "127.0.0.1",
@@ -110,7 +111,7 @@ def resume(
     """Go on with an interrupted run from its last checkpoint."""
     from . import commands
 
-    engine = commands.resume_engine(folder, commands.pick_device(device))
+    engine = commands.resume_engine(folder, commands.pick_device(device), sequence)
     commands.start(engine, headless, host, port, not no_browser)
 
 

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from . import datasets
 from .config import Config
 from .evaluation.trajectory_io import read_tum
-from .messages import Quit, Snapshot, State
+from .messages import Notice, Quit, Snapshot, State
 from .runtime.checkpoint import load_checkpoint
 from .runtime.driven import import_slam
 from .runtime.engine import Engine
@@ -29,6 +29,10 @@ from .runtime.signals import quit_on_signals
 from .types import InputError, Sequence
 
 console = Console()
+FIGURES = (
+    "sequence", "preset", "kernels", "frames", "fps_wall", "ate_rmse_cm", "loop_closures", "skipped_frames",
+    "lost_frames",
+)  # fmt: skip
 BUILT_IN = ("synthetic/studio", "synthetic/apartment", "synthetic/corridor")
 
 
@@ -61,6 +65,7 @@ def _may_have_cuda() -> bool:
 
 def make_engine(config: Config, address: str, opened: Sequence, out: Path, device: str, frames: str) -> Engine:
     """An engine for ``opened``, which came from ``address``, writing to ``out``."""
+    address = lasting_address(address)
 
     def open_again(other: str) -> Sequence:
         return opened if other == address else datasets.open_sequence(other)
@@ -70,9 +75,18 @@ def make_engine(config: Config, address: str, opened: Sequence, out: Path, devic
     )
 
 
-def resume_engine(folder: Path, device: str) -> Engine:
-    """The engine of an interrupted run. Raises InputError."""
-    return Engine.resume(folder, device=device, sequences=BUILT_IN)
+def lasting_address(address: str) -> str:
+    """The address of a sequence as it can be opened from any folder."""
+    return address if address.startswith("synthetic/") else str(Path(address).expanduser().resolve())
+
+
+def resume_engine(folder: Path, device: str, sequence: str | None) -> Engine:
+    """The engine of an interrupted run; ``sequence``: where that lies now, if it has moved. Raises InputError."""
+    address = str(load_checkpoint(folder / "checkpoints").meta["sequence"])
+    if sequence is None and not address.startswith("synthetic/") and not Path(address).exists():
+        raise InputError(f"{folder}: its sequence is no longer at {address}; say where it is with --sequence")
+    moved = None if sequence is None else lasting_address(sequence)
+    return Engine.resume(folder, device=device, sequences=BUILT_IN, sequence=moved)
 
 
 def start(engine: Engine, headless: bool, host: str, port: int, browser: bool) -> None:
@@ -90,25 +104,37 @@ def start(engine: Engine, headless: bool, host: str, port: int, browser: bool) -
 
 def run_headless(engine: Engine) -> None:
     """Run to the end with a progress line, then say what came out and where it lies."""
-    with _progress() as bar, quit_on_signals(engine):
+    window = 0
+    columns = (TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, refresh_per_second=4) as bar, quit_on_signals(engine):
         task = bar.add_task("starting", total=None)
 
         def show(s: Snapshot) -> None:
-            bar.update(task, description=progress_line(s), completed=s.frame + 1, total=s.frames_total)
+            nonlocal window
+            window = len(s.window) or window
+            bar.update(task, description=progress_line(s, window))
 
-        summary = engine.run(show)
+        def tell(notice: Notice) -> None:
+            if notice.level != "info" and engine.error is None:
+                where = "" if notice.frame is None else f"frame {notice.frame}: "
+                bar.console.print(f"{notice.level}: {where}{notice.text}", soft_wrap=True, markup=False)
+
+        summary = engine.run(show, tell)
     finish_run(engine.run_folder, summary)
 
 
-def progress_line(s: Snapshot) -> str:
-    """The state of a run in a line. loss: objective of the last mapping; residual: of the frame's direct alignment."""
-    figures = [f"{s.state.value}: frame {s.frame + 1}/{s.frames_total}", f"{s.fps_wall:.1f} frames/s"]
+def progress_line(s: Snapshot, window: int) -> str:
+    """The state of a run in a line. window: keyframes in the last bundle adjustment. loss: objective of the last
+    mapping; residual: of the frame's direct alignment."""
+    figures = [f"{s.state.value} {s.frame + 1}/{s.frames_total}", f"{s.fps_wall:.1f} frames/s"]
     if s.map_loss is not None:
         figures.append(f"loss {s.map_loss:.3f}")
-    if "align_mm" in s.losses:
-        figures.append(f"residual {s.losses['align_mm']:.1f} mm")
+    if window:
+        figures.append(f"window {window}")
     if s.ate_cm is not None:
         figures.append(f"ATE {s.ate_cm:.2f} cm")
+    if "align_mm" in s.losses:
+        figures.append(f"residual {s.losses['align_mm']:.1f} mm")
     return "  ".join(figures)
 
 
@@ -189,16 +215,16 @@ class Reports:
 def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     """Draw the picture of the run, print its figures and where they lie."""
     picture = draw_picture(folder)
-    for name in ("sequence", "preset", "kernels", "frames", "fps_wall", "ate_rmse_cm", "loop_closures", "lost_frames"):
+    for name in FIGURES:
         value = summary[name]
-        console.print(f"  {name:15} {value:.3f}" if isinstance(value, float) else f"  {name:15} {value}")
-    if summary["kernels_note"]:
-        console.print(f"  note: {summary['kernels_note']}")
-    console.print(
-        f"  mesh            {folder / 'mesh.ply'}\n  summary         {folder / 'summary.json'}", soft_wrap=True
-    )
-    if picture is not None:
-        console.print(f"  picture         {picture}", soft_wrap=True)
+        words = "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
+        console.print(f"  {name:15} {words}", soft_wrap=True, markup=False)
+    for name, path in {"mesh": folder / "mesh.ply", "picture": picture, "summary": folder / "summary.json"}.items():
+        if path is not None and path.is_file():
+            console.print(f"  {name:15} {path}", soft_wrap=True, markup=False)
+    for note in (summary["kernels_note"], *(f"{name} not saved ({why})" for name, why in summary["not_saved"].items())):
+        if note:
+            console.print(f"  note: {note}", soft_wrap=True, markup=False)
 
 
 def draw_picture(folder: Path) -> Path | None:

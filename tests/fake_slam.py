@@ -26,6 +26,7 @@ class FakeSequence:
     """Poses on a helix. bad: frames that cannot be read; times: other time stamps than index / 30."""
 
     name, layout, preset, intrinsics, bounds = "fake", "fake", "lite", CAMERA, None
+    depth_m = 2.0
 
     def __init__(self, count: int = 30, bad: tuple[int, ...] = (), times=None, truth: bool = True) -> None:
         self.count, self.bad = count, bad
@@ -43,7 +44,7 @@ class FakeSequence:
             raise FrameError(f"/data/{index:06d}.png: truncated; copy it again")
         color = np.full((48, 64, 3), index % 256, np.uint8)
         pose = None if self.poses is None else self.poses[index]
-        return Frame(index, float(self.times[index]), color, np.full((48, 64), 2.0, np.float32), pose)
+        return Frame(index, float(self.times[index]), color, np.full((48, 64), self.depth_m, np.float32), pose)
 
     def timestamps(self) -> np.ndarray:
         return self.times
@@ -136,6 +137,7 @@ class FakeSlam:
             track_ms=2.0,
             map_ms=100.0 if first else 3.0,
             loop=loop,
+            note="lost" if frame.index in b.lost else "",
         )
 
     def finish(self, interrupt=None) -> None:

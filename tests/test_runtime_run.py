@@ -25,7 +25,7 @@ from ecslam.types import InputError
 SUMMARY_KEYS = """
     sequence preset device kernels seed frames keyframes wall_s setup_s fps_wall fps_engine
     ate_rmse_cm ate_mean_cm ate_max_cm parameters parameters_mb peak_memory_mb skipped_frames lost_frames loop_closures
-    kernels_note unreadable_frames export_s not_saved
+    kernels_note unreadable_frames frames_without_ground_truth warnings export_s not_saved
 """
 
 
@@ -160,9 +160,10 @@ def test_the_progress_line_names_the_loss_of_mapping_and_the_residual_of_trackin
     seen = []
     engine(tmp_path, FakeSequence(8)).run(seen.append)
     assert (seen[0].map_loss, seen[-1].map_loss) == (None, 0.5 + 0.25 * QUICK.mapping.iterations)
-    assert " loss " not in progress_line(seen[0])
-    tracked = replace(seen[-1], losses={"align_mm": 6.21}, map_loss=1.25, ate_cm=0.5)
-    assert progress_line(tracked).split("  ")[2:] == ["loss 1.250", "residual 6.2 mm", "ATE 0.50 cm"]
+    assert " loss " not in progress_line(seen[0], 0)
+    tracked = replace(seen[-1], state=State.TRACKING, losses={"align_mm": 6.21}, map_loss=1.25, ate_cm=0.5)
+    figures = ["tracking 8/8", "loss 1.250", "window 7", "ATE 0.50 cm", "residual 6.2 mm"]
+    assert [part for part in progress_line(tracked, 7).split("  ") if "frames/s" not in part] == figures
 
 
 def test_a_full_disk_does_not_end_the_run(tmp_path, monkeypatch):
@@ -231,3 +232,100 @@ def test_the_row_of_a_skipped_frame_is_the_one_before():
 def test_the_frame_at_work_has_no_pose_to_show():
     tally = Tally(position=4, rows=[0, 2], skipped=1)
     assert tally.row_of_each_frame().tolist() == [0, 0, 1]
+
+
+def test_what_is_odd_about_a_sequence_is_told_and_kept(tmp_path):
+    sequence = FakeSequence(12, times=np.arange(12) / 10 + 5.0 * (np.arange(12) > 7))
+    sequence.notes = ("2 images have no partner",)
+    sequence.depth_m = 30.0
+    told = []
+    summary = engine(tmp_path, sequence).run(tell=told.append)
+    assert summary["warnings"][:2] == ["2 images have no partner", "1 gaps of more than 1 s between frames"]
+    assert summary["warnings"][2] == "frame 0: the median depth is 30 m: probably a wrong depth scale"
+    assert len(summary["warnings"]) == 3
+    assert next(n.text for n in told if n.level == "warning") == "2 images have no partner"
+    logged = [e["text"] for e in read_lines(tmp_path / "events.jsonl")]
+    assert "1 gaps of more than 1 s between frames" in logged
+
+
+def test_being_lost_is_said_once_and_marks_the_poses(tmp_path):
+    summary = run(tmp_path, behaviour=Behaviour(lost=tuple(range(6, 16))))
+    assert summary["lost_frames"] == 10
+    assert summary["warnings"] == ["frame 6: lost"]
+    metrics = list(read_lines(tmp_path / "metrics.jsonl"))
+    assert [m["frame"] for m in metrics if m["lost"]] == list(range(6, 16))
+    assert [m["tracked"] for m in metrics] == [not m["lost"] for m in metrics]
+
+
+def test_why_no_frame_could_be_used(tmp_path):
+    with pytest.raises(
+        InputError, match=r"none of 4 frames could be used, the first because: frame 0: no usable depth"
+    ):
+        run(tmp_path, FakeSequence(4), Behaviour(empty=(0, 1, 2, 3)))
+
+
+def test_frames_without_a_true_pose_are_left_out_of_the_error_and_counted(tmp_path):
+    sequence = FakeSequence(12)
+    sequence.poses[[2, 7]] = np.nan
+    summary = run(tmp_path / "some", sequence)
+    assert summary["frames_without_ground_truth"] == 2
+    assert summary["ate_rmse_cm"] < 5
+    assert len(np.loadtxt(tmp_path / "some/groundtruth.txt")) == 10
+    sequence.poses[:] = np.inf
+    summary = run(tmp_path / "none", sequence)
+    assert summary["ate_rmse_cm"] is summary["frames_without_ground_truth"] is None
+    assert not (tmp_path / "none/groundtruth.txt").exists()
+
+
+def interrupted(out: Path) -> None:
+    with running(out, FakeSequence(30), paused_at=12):
+        pass
+
+
+def test_resume_notes_where_the_sequence_has_moved(tmp_path):
+    interrupted(tmp_path)
+    moved = FakeSequence(30)
+    moved.name = "moved"
+    Engine.resume(tmp_path, sequence=moved, make=maker()).run()
+    assert json.loads((tmp_path / "run.json").read_text())["sequence"] == "moved"
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 30
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda s: setattr(s, "intrinsics", replace(s.intrinsics, width=32)), "width was 64 and is 32"),
+        (lambda s: setattr(s, "times", s.times + 0.5), "no longer those that this run has done"),
+        (lambda s: setattr(s, "times", s.times[:8]), "12 of them; there are 8 now"),
+    ],
+)
+def test_resume_refuses_a_sequence_that_has_changed(tmp_path, change, says):
+    interrupted(tmp_path)
+    other = FakeSequence(30)
+    change(other)
+    with pytest.raises(InputError, match=says) as caught:
+        Engine.resume(tmp_path, sequence=other, make=maker())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_run_killed_while_the_last_mesh_was_made_is_finished_without_mapping_again(tmp_path):
+    whole = run(tmp_path)
+    before = (tmp_path / "trajectory.txt").read_bytes()
+    (tmp_path / "summary.json").unlink()
+    (tmp_path / "mesh.ply").unlink()
+    make = maker()
+    again = Engine.resume(tmp_path, sequence=FakeSequence(30), make=make).run()
+    assert not make.made[0].finished
+    assert (tmp_path / "trajectory.txt").read_bytes() == before
+    assert (again["frames"], again["ate_rmse_cm"]) == (whole["frames"], whole["ate_rmse_cm"])
+    assert (tmp_path / "mesh.ply").stat().st_size > 1000
+
+
+def test_a_mesh_that_cannot_be_made_is_said(tmp_path, monkeypatch):
+    def fail(*args, **options):
+        raise MemoryError("too little")
+
+    monkeypatch.setattr("ecslam.runtime.workshop.build_mesh", fail)
+    summary = run(tmp_path)
+    assert summary["frames"] == 30
+    assert f"mesh.ply was not made; make it with: ecslam mesh {tmp_path}" in summary["warnings"]

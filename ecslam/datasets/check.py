@@ -205,7 +205,20 @@ def _odd_images(depth: DepthStats, black: int, unreadable: tuple[str, ...], trie
     if depth.missing > MOST_WITHOUT_DEPTH and len(unreadable) < tried:
         yield f"{depth.missing:.0%} of the pixels have no depth"
     if depth.median_m < USUAL_DEPTH_M[0] or depth.median_m > USUAL_DEPTH_M[1]:
-        yield f"the median depth is {depth.median_m:.3g} m: probably a wrong depth scale"
+        yield _odd_median(depth.median_m)
+
+
+def odd_depth(depth: NDArray[np.float32]) -> str:
+    """What is odd about a frame's depth [H, W] in metres as a whole, or "": no depth, or hardly a room's."""
+    known = depth[::4, ::4][np.isfinite(depth[::4, ::4]) & (depth[::4, ::4] > 0)]
+    if not len(known):
+        return "no depth at all"
+    median_m = float(np.median(known))
+    return "" if USUAL_DEPTH_M[0] <= median_m <= USUAL_DEPTH_M[1] else _odd_median(median_m)
+
+
+def _odd_median(median_m: float) -> str:
+    return f"the median depth is {median_m:.3g} m: probably a wrong depth scale"
 
 
 def _odd_poses(poses: PoseStats | None) -> Iterator[str]:

@@ -18,7 +18,7 @@ from typing import Any
 from .. import config as configuration
 from .. import datasets
 from ..config import Config
-from ..messages import Command, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
+from ..messages import Command, Event, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint, load_checkpoint
 from .control import Control, Turn
@@ -68,6 +68,7 @@ class Engine:
         self._feed = Feed()
         self._next_snapshot = 0.0
         self._progress: Callable[[Snapshot], None] = lambda snapshot: None
+        self._tell: Callable[[Notice], None] = lambda notice: None
         self._thread: threading.Thread | None = None
         self.summary: dict[str, Any] | None = None
         self.error: Exception | None = None
@@ -77,11 +78,11 @@ class Engine:
         self._control.begin(config, opened.layout, len(plan.sequence), self._run.tally.position)
 
     @classmethod
-    def resume(cls, folder: Path, *, sequence: Sequence | None = None, **options: Any) -> Engine:
-        """Go on with an interrupted run in ``folder``; ``options`` as for the class. sequence: where its address, the
-        one in ``run.json``, cannot be opened again. Raises InputError."""
+    def resume(cls, folder: Path, *, sequence: Sequence | str | None = None, **options: Any) -> Engine:
+        """Go on with an interrupted run in ``folder``; ``options`` as for the class. sequence: where it has moved from
+        the address in ``run.json``. Raises InputError."""
         checkpoint = load_checkpoint(folder / "checkpoints")
-        if checkpoint.meta["finished"]:
+        if checkpoint.meta["finished"] and (folder / "summary.json").is_file():
             raise InputError(f"{folder}: this run is finished; look at it with: ecslam view {folder}")
         config = configuration.apply(Config(), checkpoint.meta["config"], str(folder))
         opened = sequence or checkpoint.meta["sequence"]
@@ -118,12 +119,17 @@ class Engine:
 
     # ---- life -----------------------------------------------------------------------------------------------------
 
-    def run(self, progress: Callable[[Snapshot], None] | None = None) -> dict[str, Any]:
+    def run(
+        self,
+        progress: Callable[[Snapshot], None] | None = None,
+        tell: Callable[[Notice], None] | None = None,
+    ) -> dict[str, Any]:
         """Run to the end of the sequence (or ``Stop`` or ``Quit``) in this thread and return the summary.
 
-        progress: called with every snapshot. Raises what stopped the run: InputError for what a user can mend.
+        progress: called with every snapshot; tell: with every notice. Raises what stopped the run: InputError for what
+        a user can mend.
         """
-        self._progress = progress or self._progress
+        self._progress, self._tell = progress or self._progress, tell or self._tell
         self._main(stay=False)
         if self.error is not None:
             raise self.error
@@ -182,7 +188,7 @@ class Engine:
             folder = RunFolder.create(plan.out, self._not_saved)
         else:
             folder = RunFolder.reopen(plan.out, resumed.frame, self._not_saved)
-        return Run(plan, folder, self._feed.publish, self._make, self._checkpoint_every, resumed)
+        return Run(plan, folder, self._emit, self._make, self._checkpoint_every, resumed)
 
     def _one_run(self) -> Turn:
         """From the first frame to the summary; what ended it."""
@@ -290,7 +296,12 @@ class Engine:
         self._workshop.live(run)
 
     def _not_saved(self, text: str) -> None:
-        self._feed.publish(Notice("error", text))
+        self._emit(Notice("error", text))
+
+    def _emit(self, event: Event) -> None:
+        self._feed.publish(event)
+        if isinstance(event, Notice):
+            self._tell(event)
 
 
 def _words(error: Exception) -> str:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from .. import config as configuration
 from ..config import Config
+from ..datasets.check import odd_depth
+from ..datasets.views import problems
 from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
 from ..messages import Event, LoopEvent, Notice, StepReport
@@ -32,6 +34,10 @@ ATE_EVERY = 10
 TRAJECTORY_EVERY = 100
 THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
+MOST_WARNINGS = 100
+SAME = 1e-6
+CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+GOOD_NEWS = ("relocalised", "recovered")
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class Run:
         self.slam: SlamLike | None = None
         self.tally = Tally(**resumed.meta["tally"]) if resumed else Tally()
         self.clock = Stopwatch(self.tally.wall_s)
-        self.truth = plan.sequence.poses_gt()
+        self.truth = _known(plan.sequence.poses_gt())
         self.torn = False
         self.report: StepReport | None = None
         self.ate_cm: Spread | None = None
@@ -79,15 +85,19 @@ class Run:
         self.thumbnails: dict[int, bytes] = {}
         self._color: NDArray[np.uint8] | None = None
         self.lost_for = 0
+        self._settled = False
         if resumed:
+            self._recognise()
+            self._settled = bool(resumed.meta["finished"])
             self._build(None, resumed.arrays)
+            self._require_same_times()
             self.thumbnails, self.loops = folder.thumbnails(), folder.loops()
         else:
             self._describe()
 
     def _describe(self) -> None:
         """Write what the run is about, before it begins."""
-        s, k = self.plan.sequence, self.plan.sequence.intrinsics
+        s = self.plan.sequence
         about: dict[str, Any] = {
             "sequence": self.plan.address,
             "name": s.name,
@@ -96,12 +106,34 @@ class Run:
             "frames_total": len(s),
             "device": self.plan.device,
         }
-        about |= {name: getattr(k, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        about |= {name: getattr(s.intrinsics, name) for name in CAMERA}
         self.folder.write("run.json", about)
         self.folder.write("config.yaml", configuration.to_yaml(self.config))
         if self.truth is not None:
             known = np.isfinite(self.truth).all((1, 2))
             self.folder.write("groundtruth.txt", format_tum(s.timestamps()[known], self.truth[known]))
+
+    def _recognise(self) -> None:
+        """Note where the sequence is now. Raises InputError when it is not the one that the run was begun with."""
+        about, now = self.folder.about(), self.plan.sequence.intrinsics
+        for name in CAMERA:
+            was, here = about.get(name, np.nan), getattr(now, name)
+            if not abs(was - here) < SAME:
+                raise InputError(
+                    f"{self.plan.address}: not the sequence that this run was begun with ({name} was {was:g} and is "
+                    f"{here:g}); give that one with --sequence"
+                )
+        if about.get("sequence") != self.plan.address:
+            self.folder.write("run.json", about | {"sequence": self.plan.address})
+
+    def _require_same_times(self) -> None:
+        """Raises InputError when the frames that are done are not those of the sequence."""
+        times, rows, known = self.plan.sequence.timestamps(), np.array(self.tally.rows, np.int64), self.timestamps()
+        if len(times) < self.tally.position or (len(rows) and np.abs(times[rows] - known).max() > SAME):
+            raise InputError(
+                f"{self.plan.address}: its frames are no longer those that this run has done ({self.tally.position} of "
+                f"them; there are {len(times)} now); put them back or start again with ecslam run"
+            )
 
     # ---- frames ---------------------------------------------------------------------------------------------------
 
@@ -111,6 +143,9 @@ class Run:
         Raises InputError when too many frames are unreadable, and whatever ``interrupt`` raises (the run is then
         ``torn``: the frame at work is lost and there are no more checkpoints).
         """
+        if self.tally.position == 0:
+            for text in problems(self.plan.sequence):
+                self.warn(text)
         self.tally.position = index + 1
         if isinstance(item, FrameError):
             self.tally.unreadable.append(str(item))
@@ -121,6 +156,8 @@ class Run:
             way = "repeats" if item.timestamp == last else "goes back in"
             self._skip(index, f"frame {index} {way} time ({item.timestamp:.6f} s after {last:.6f} s)")
             return None
+        if self._color is None and (odd := odd_depth(item.depth)):
+            self.warn(odd, index)
         self._color = item.color
         try:
             report = self._step(item, interrupt)
@@ -170,6 +207,7 @@ class Run:
 
     def _skip(self, index: int, why: str) -> None:
         self.tally.skipped += 1
+        self.tally.first_skip = self.tally.first_skip or why
         self.notice("warning", f"skipped: {why}", index)
         if self.tally.too_many_unreadable:
             bad = self.tally.unreadable
@@ -181,8 +219,10 @@ class Run:
     def require_frames(self) -> None:
         """Raises InputError when no frame so far could be used."""
         if not self.tally.rows:
-            why = "; ".join(self.tally.unreadable[:1]) or "they do not move on in time"
-            raise InputError(f"{self.plan.address}: none of {self.tally.position} frames could be used ({why})")
+            raise InputError(
+                f"{self.plan.address}: none of {self.tally.position} frames could be used, the first because: "
+                f"{self.tally.first_skip}; look at it with: ecslam check"
+            )
 
     def _record(self, report: StepReport, frame: Frame) -> None:
         self.tally.add(report)
@@ -200,8 +240,10 @@ class Run:
             self.loops.append(report.loop)
             self.folder.event(report.loop)
             self._emit(report.loop)
-        if report.note:
-            self.notice("warning" if report.lost else "info", report.note, report.frame)
+        if report.note in GOOD_NEWS:
+            self.notice("info", report.note, report.frame)
+        elif report.note and self.lost_for <= 1:
+            self.warn(report.note, report.frame)
         if self._checkpoints.due(self.tally.position):
             self.checkpoint()
         if len(self.tally.rows) % TRAJECTORY_EVERY == 0:
@@ -218,6 +260,12 @@ class Run:
         notice = Notice(level, text, frame)
         self.folder.event(notice)
         self._emit(notice)
+
+    def warn(self, text: str, frame: int | None = None) -> None:
+        """Tell the world what a person should know, and keep it for the summary."""
+        self.notice("warning", text, frame)
+        if len(self.tally.warnings) < MOST_WARNINGS:
+            self.tally.warnings.append(text if frame is None else f"frame {frame}: {text}")
 
     # ---- what there is so far ---------------------------------------------------------------------------------------
 
@@ -240,6 +288,11 @@ class Run:
         """Bring the ATE up to date."""
         error = None if self.truth is None else absolute_error(self.poses(), self.truth[self.tally.rows])
         self.ate_cm = error.cm if error else None
+
+    @property
+    def without_truth(self) -> int | None:
+        """How many processed frames have no usable true pose and so no part in the ATE; None without ground truth."""
+        return None if self.truth is None else int((~np.isfinite(self.truth[self.tally.rows]).all((1, 2))).sum())
 
     def freeze(self, points: int = MESH_POINTS) -> FrozenMap | None:
         """The map as it is now, with about so many measured points at most; None before there is one."""
@@ -281,7 +334,7 @@ class Run:
 
     def end(self, complete: bool, interrupt: Callable[[], None]) -> None:
         """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock."""
-        if complete and self.slam is not None and self.tally.rows and not self.torn:
+        if complete and self.slam is not None and self.tally.rows and not self.torn and not self._settled:
             try:
                 self.slam.finish(interrupt)
             except Abandoned:
@@ -299,3 +352,8 @@ class Run:
         self.folder.write("summary.json", summary)
         self.folder.close()
         return summary
+
+
+def _known(truth: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Ground truth [N, 4, 4], or None where no frame has a finite pose."""
+    return truth if truth is not None and np.isfinite(truth).all((1, 2)).any() else None

@@ -23,6 +23,7 @@ says what is missing, and why.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import fields
@@ -74,6 +75,7 @@ class RunFolder:
         """Go on in ``path`` from frame ``position``: what was logged for it and later frames is dropped."""
         require_space(path, NEEDED_MB)
         remove_temporaries(path)
+        (path / "summary.json").unlink(missing_ok=True)
         for name in LOGS:
             keep_lines(path / name, lambda line: (line.get("frame") or 0) < position)
         return cls(path, problem)
@@ -134,6 +136,14 @@ class RunFolder:
         except OSError as error:
             self.missing(name, error)
         self._append("keyframes.jsonl", {"frame": frame, "c2w": c2w[:3].reshape(-1), "thumbnail": name})
+
+    def about(self) -> dict[str, Any]:
+        """``run.json``. Raises InputError when it is missing or damaged."""
+        try:
+            about = json.loads((self.path / "run.json").read_text("utf-8"))
+            return dict(about)
+        except (OSError, ValueError, TypeError):
+            raise InputError(f"{self.path / 'run.json'}: missing or damaged; start again with ecslam run") from None
 
     def thumbnails(self) -> dict[int, bytes]:
         """The saved keyframe pictures, by frame; those that are still there."""

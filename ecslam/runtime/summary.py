@@ -40,6 +40,8 @@ def summarise(run: Run, export_s: float) -> dict[str, Any]:
         "lost_frames": tally.lost,
         "loop_closures": tally.loops,
         "unreadable_frames": tally.unreadable,
+        "frames_without_ground_truth": run.without_truth,
+        "warnings": tally.warnings,
         "export_s": round(export_s, 3),
         "not_saved": dict(run.folder.not_saved),
     }

@@ -21,7 +21,8 @@ class Tally:
     """Counters that survive a checkpoint.
 
     position: frames of the sequence done, skipped ones included. rows: frame index of each pose of the trajectory.
-    unreadable: a sentence for each frame that could not be read. wall_s: seconds spent, pauses left out, and
+    unreadable: a sentence for each frame that could not be read; first_skip: why the first one was left out; warnings:
+    what a person should know besides. wall_s: seconds spent, pauses left out, and
     setup_s: seconds that loading the engine's libraries took before, also left out. engine_ms:
     tracking and mapping without the first frame (its initialisation), as Co-SLAM counts.
     """
@@ -30,6 +31,8 @@ class Tally:
     rows: list[int] = field(default_factory=list)
     keyframes: list[int] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
+    first_skip: str = ""
+    warnings: list[str] = field(default_factory=list)
     skipped: int = 0
     lost: int = 0
     loops: int = 0

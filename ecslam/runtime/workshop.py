@@ -110,8 +110,9 @@ class Workshop:
 
         self.live(run, at_once=True)
         self._jobs.submit(job)
-        if not control.wait_for(done.is_set):
-            run.notice("warning", f"left before mesh.ply was made; make it with: ecslam mesh {run.folder.path}")
+        control.wait_for(done.is_set)
+        if not (run.folder.path / "mesh.ply").is_file():
+            run.warn(f"mesh.ply was not made; make it with: ecslam mesh {run.folder.path}")
 
     def _save(self, run: Run, name: str, frozen: FrozenMap, voxel_m: float, max_triangles: int) -> None:
         mesh = build_mesh(frozen, voxel_m, max_triangles, self._leaving).mesh
