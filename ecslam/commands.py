@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from . import datasets
 from .config import Config
+from .datasets.roots import sequences_under
 from .evaluation.trajectory_io import read_tum
 from .messages import Notice, Quit, Snapshot, State
 from .runtime.checkpoint import load_checkpoint
@@ -63,15 +64,22 @@ def _may_have_cuda() -> bool:
     return sys.platform != "linux" or any(Path(name).exists() for name in ("/dev/nvidiactl", "/dev/dxg", "/dev/nvmap"))
 
 
-def make_engine(config: Config, address: str, opened: Sequence, out: Path, device: str, frames: str) -> Engine:
-    """An engine for ``opened``, which came from ``address``, writing to ``out``."""
+def offered(roots: list[Path]) -> tuple[str, ...]:
+    """The sequences that a dashboard offers: the built-in rooms and those below ``roots``. Raises InputError."""
+    return (*BUILT_IN, *(address for root in roots for address in sequences_under(root)))
+
+
+def make_engine(
+    config: Config, address: str, opened: Sequence, out: Path, device: str, frames: str, offers: tuple[str, ...]
+) -> Engine:
+    """An engine for ``opened``, which came from ``address``, writing to ``out``. offers: what a restart may choose."""
     address = lasting_address(address)
 
     def open_again(other: str) -> Sequence:
         return opened if other == address else datasets.open_sequence(other)
 
     return Engine(
-        config, address, out, device=device, frames=frames, sequences=(address, *BUILT_IN), open_sequence=open_again
+        config, address, out, device=device, frames=frames, sequences=(address, *offers), open_sequence=open_again
     )
 
 
@@ -247,12 +255,13 @@ def evaluate(folder: Path) -> None:
     """Fill ``summary.json`` with the figures that need ground truth, and print them."""
     with _progress() as bar:
         task = bar.add_task("comparing with the ground truth", total=1.0)
-        figures = judge_run(folder, lambda done: bar.update(task, completed=done))
+        notes: list[str] = []
+        figures = judge_run(folder, lambda done: bar.update(task, completed=done), tell=notes.append)
         bar.update(task, completed=1.0)
     for name, value in figures.items():
         console.print(f"  {name:18} {value:.3f}")
-    if "depth_l1_cm" not in figures:
-        console.print("no reference mesh in this sequence, or nothing of it in the map: the trajectory's figures only")
+    for note in notes:
+        console.print(f"  note: {note}", soft_wrap=True, markup=False)
 
 
 def remesh(folder: Path, voxel_m: float, out: Path) -> None:

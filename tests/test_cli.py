@@ -36,6 +36,7 @@ SUMMARY_KEYS = {
     "ate_rmse_cm", "ate_mean_cm", "ate_max_cm", "parameters", "parameters_mb", "peak_memory_mb", "skipped_frames",
     "lost_frames", "loop_closures",
 }  # fmt: skip
+EMPTY = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
 EVALUATED_KEYS = {"depth_l1_cm", "accuracy_cm", "completion_cm", "completion_ratio"}
 
 
@@ -156,6 +157,7 @@ def test_same_seed_gives_the_same_bytes(finished, sequence, tmp_path):
     assert (tmp_path / "again" / "trajectory.txt").read_bytes() == (finished / "trajectory.txt").read_bytes()
 
 
+@pytest.mark.slow
 def test_eval_finds_a_mesh_equal_to_itself(finished, sequence, tmp_path):
     room, folder = shutil.copytree(sequence, tmp_path / "room"), shutil.copytree(finished, tmp_path / "run")
     shutil.copy(folder / "mesh.ply", room / "mesh.ply")
@@ -167,9 +169,27 @@ def test_eval_finds_a_mesh_equal_to_itself(finished, sequence, tmp_path):
     after = summary(folder)
     assert after.keys() >= SUMMARY_KEYS | EVALUATED_KEYS
     assert after["ate_rmse_cm"] == pytest.approx(before["ate_rmse_cm"])
-    assert max(after["accuracy_cm"], after["completion_cm"]) < 0.5
+    assert max(after["accuracy_cm"], after["completion_cm"]) < 0.6  # the distance between two samplings of one surface
     assert after["completion_ratio"] > 99.9
     assert "completion_ratio" in done.out
+
+
+@pytest.mark.parametrize("lacking", ["surface", "mesh", "sequence"])
+def test_eval_gives_the_trajectory_where_there_is_no_surface_to_compare(finished, tmp_path, lacking):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    if lacking == "surface":
+        (folder / "mesh.ply").write_bytes(mesh_bytes(EMPTY, "ply"))
+    elif lacking == "mesh":
+        (folder / "mesh.ply").unlink()
+    else:
+        about = json.loads((folder / "run.json").read_text())
+        (folder / "run.json").write_text(json.dumps(about | {"sequence": "/nowhere"}))
+    done = ecslam("eval", folder)
+    assert done.code == 0, done.err
+    assert "ate_rmse_cm" in done.out
+    assert "depth_l1_cm" not in done.out
+    assert "the trajectory's figures only" in done.out
+    assert ("/nowhere: no such folder" if lacking == "sequence" else "the map has no surface") in done.out
 
 
 def test_mesh_is_made_again_at_another_size(finished, tmp_path):
@@ -183,8 +203,7 @@ def test_mesh_is_made_again_at_another_size(finished, tmp_path):
 
 def test_a_run_without_a_surface_ends_without_a_picture(finished, tmp_path):
     folder = shutil.copytree(finished, tmp_path / "run", ignore=shutil.ignore_patterns("picture.png"))
-    empty = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
-    (folder / "mesh.ply").write_bytes(mesh_bytes(empty, "ply"))
+    (folder / "mesh.ply").write_bytes(mesh_bytes(EMPTY, "ply"))
     assert draw_picture(folder) is None
     assert not (folder / "picture.png").exists()
 

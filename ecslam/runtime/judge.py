@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,33 +19,59 @@ from .files import write_atomic
 
 
 def judge_run(
-    folder: Path, progress: Callable[[float], None] | None = None, *, surface: bool = True
+    folder: Path,
+    progress: Callable[[float], None] | None = None,
+    *,
+    surface: bool = True,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> dict[str, float]:
     """The figures that need ground truth, also written into the run's ``summary.json``.
 
     ate_*_cm, rpe_cm, rpe_deg and, where the sequence has a reference mesh, depth_l1_cm, accuracy_cm, completion_cm,
     completion_ratio (per cent). progress: gets the share done in 0..1. surface: False leaves out the latter, which
-    take a minute. Raises InputError without a finished run or ground truth.
+    take a minute. tell: gets a sentence when some of them are missing. Raises InputError without a finished run or
+    ground truth.
     """
-    from ..evaluation.report import evaluate_run
-
-    summary_path, about_path = folder / "summary.json", folder / "run.json"
-    if not summary_path.is_file() or not about_path.is_file():
-        raise InputError(f"{folder}: no finished run here; give the folder that `ecslam run --out` wrote")
-    summary, about = json.loads(summary_path.read_text()), json.loads(about_path.read_text())
+    summary_path = folder / "summary.json"
+    try:
+        summary, about = (dict(json.loads((folder / name).read_text())) for name in ("summary.json", "run.json"))
+    except (OSError, ValueError, TypeError):
+        raise InputError(f"{folder}: no finished run here; give the folder that `ecslam run --out` wrote") from None
     times, poses = read_tum(folder / "trajectory.txt")
     truth = read_truth(folder, times)
     if truth is None:
         raise InputError(f"{folder}: the sequence has no ground truth, so there is nothing to compare with")
     figures = _trajectory_figures(poses, truth)
-    sequence = datasets.select_frames(datasets.open_sequence(about["sequence"]), about["frames"])
-    reference = sequence.reference_mesh() if surface else None
-    if reference is not None:
-        mesh = read_mesh(folder / "mesh.ply")
-        found = evaluate_run(mesh, reference, sequence.intrinsics, truth, progress=progress)
-        figures |= {name: value for name, value in found.items() if value is not None}
+    if surface:
+        found, note = _surface_figures(folder, about, truth, progress)
+        figures |= found
+        if note:
+            tell(note)
     write_atomic(summary_path, json.dumps(summary | figures, indent=2).encode())
     return figures
+
+
+def _surface_figures(
+    folder: Path, about: dict[str, Any], truth: NDArray[np.float64], progress: Callable[[float], None] | None
+) -> tuple[dict[str, float], str]:
+    """The figures of the mesh, and why there are none or not all of them ("" when there are)."""
+    from ..evaluation.report import evaluate_run
+
+    try:
+        sequence = datasets.select_frames(datasets.open_sequence(about["sequence"]), about["frames"])
+        reference = sequence.reference_mesh()
+    except InputError as error:
+        return {}, f"the trajectory's figures only, for the reference mesh is out of reach: {error}"
+    if reference is None:
+        return {}, "the trajectory's figures only, for the sequence has no reference mesh"
+    try:
+        mesh = read_mesh(folder / "mesh.ply")
+    except InputError as error:
+        return {}, f"the trajectory's figures only, for the map has no surface: {error}"
+    found = evaluate_run(mesh, reference, sequence.intrinsics, truth, progress=progress)
+    missing = ", ".join(name for name, value in found.items() if value is None)
+    note = f"without {missing}, for nothing of the map's surface was in view" if missing else ""
+    return {name: value for name, value in found.items() if value is not None}, note
 
 
 def _trajectory_figures(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, float]:
