@@ -41,6 +41,10 @@ Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ... or auto: a CUDA
 Schedule = Annotated[str | None, typer.Option(help="strict (deterministic on a CPU) or overlap (two threads).")]
 Headless = Annotated[bool, typer.Option("--headless", help="No dashboard: run, write the run folder, end.")]
 Out = Annotated[Path | None, typer.Option(help="Run folder; default: runs/SEQUENCE-PRESET.")]
+Data = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FOLDER", help="A folder with sequences that the dashboard offers too; may be repeated."),
+]
 Host = Annotated[str, typer.Option(help="Where the dashboard listens; any but 127.0.0.1 needs the token it prints.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the dashboard; 0 = any free one.")]
 NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Do not open a browser; the address is printed.")]
@@ -59,6 +63,7 @@ def run(
     schedule: Schedule = None,
     headless: Headless = False,
     out: Out = None,
+    data: Data = None,
     host: Host = "127.0.0.1",
     port: Port = 8080,
     no_browser: NoBrowser = False,
@@ -69,7 +74,8 @@ def run(
     opened = commands.open_sequence(sequence)
     resolved = resolve_config(preset or opened.preset, opened.layout, config, settings, seed, schedule)
     folder = out or Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}"
-    engine = commands.make_engine(resolved, sequence, opened, folder, commands.pick_device(device), frames)
+    offered = commands.offered(data or [])
+    engine = commands.make_engine(resolved, sequence, opened, folder, commands.pick_device(device), frames, offered)
     commands.start(engine, headless, host, port, not no_browser)
 
 

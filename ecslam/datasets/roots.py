@@ -1,0 +1,45 @@
+"""The sequences below a folder, for a dashboard to choose from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+from ..types import InputError
+from .registry import layouts
+
+DEEPEST, MOST_FOLDERS = 3, 2000
+
+
+def sequences_under(root: Path) -> tuple[str, ...]:
+    """Addresses of the sequences that are ``root`` itself or lie up to ``DEEPEST`` folders below it, in order.
+
+    Recognised by file names alone, so one that is damaged is among them. Raises InputError when there is no such
+    folder, or nothing in it that is recognised.
+    """
+    folder = root.expanduser().resolve()
+    if not folder.is_dir():
+        raise InputError(f"--data {root}: no such folder; give one that holds sequences")
+    found = tuple(str(each) for each in islice(_folders(folder, DEEPEST), MOST_FOLDERS) if _known(each))
+    if not found:
+        raise InputError(f"--data {root}: no sequence in it; `ecslam check FOLDER` says what is wrong with one")
+    return found
+
+
+def _folders(folder: Path, deeper: int) -> Iterator[Path]:
+    """``folder`` and the folders below it that may hold a sequence; nothing lies inside one."""
+    yield folder
+    if deeper == 0 or _known(folder):
+        return
+    try:
+        inside = sorted(entry.path for entry in os.scandir(folder) if entry.is_dir() and entry.name[0] != ".")
+    except OSError:
+        return
+    for path in inside:
+        yield from _folders(Path(path), deeper - 1)
+
+
+def _known(folder: Path) -> bool:
+    return any(layout.sniff(folder) for layout in layouts())
