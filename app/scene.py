@@ -77,9 +77,9 @@ class Scene:
                 f"/{name}", _NO_LINES, color, thickness=width, thickness_units="screen"
             )
             for name, color, width in (
-                ("trajectory/ground truth", theme.TRUTH, 2.0),
-                ("trajectory/estimate", theme.ESTIMATE, 3.0),
-                ("trajectory/other run", theme.OTHER, 3.0),
+                ("trajectory/ground truth", theme.TRUTH, 1.8),
+                ("trajectory/estimate", theme.ESTIMATE, 5.0),
+                ("trajectory/other run", theme.OTHER, 3.4),
                 ("trajectory/before the loop", theme.BEFORE, 2.0),
                 ("keyframes/all", theme.KEYFRAME, 1.0),
                 ("keyframes/window", theme.WINDOW, 2.2),

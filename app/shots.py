@@ -14,16 +14,12 @@ from PIL import Image
 
 from ecslam.types import InputError
 
-from . import theme
 from .browser import dismiss_toasts, launch, new_page
 from .server import Dashboard, view
 
 DESKTOP, PHONE = (1440, 860), (390, 780)
 SETTLE_MS, MOST_LOOKS = 1500, 30
-COLORS, FLAT = 256, 48
 STILL = 0.02  # mean change of grey values
-_MEANINGS = (theme.ESTIMATE, theme.TRUTH, theme.KEYFRAME, theme.WINDOW, theme.LOOP, theme.BEFORE, theme.OTHER)
-_KEPT_COLORS = ((255, 255, 255), (0, 0, 0), theme.ACCENT, *_MEANINGS, *(theme.paler(color) for color in _MEANINGS))
 
 
 def take(runs: list[Path], out: Path) -> list[Path]:
@@ -64,7 +60,7 @@ def _take_one(
     page.wait_for_timeout(SETTLE_MS)
     act(page, dashboard)
     dismiss_toasts(page)
-    path.write_bytes(few_colors(_still(page)))
+    path.write_bytes(lighter(_still(page)))
     page.close()
     return path
 
@@ -82,20 +78,10 @@ def _still(page: Any) -> bytes:
     return bytes(png)
 
 
-def few_colors(png: bytes) -> bytes:
-    """A screenshot as a PNG of few colours, a third of its size.
-
-    They are all that carry meaning, those that fill flat areas, and a choice that stands for the rest.
-    """
-    picture = Image.open(io.BytesIO(png)).convert("RGB")
-    colors, counts = np.unique(np.asarray(picture).reshape(-1, 3), axis=0, return_counts=True)
-    exact = [*_KEPT_COLORS, *colors[np.argsort(-counts, kind="stable")[:FLAT]].tolist()]
-    count = COLORS - len(exact)
-    common = picture.quantize(count, method=Image.Quantize.MEDIANCUT).getpalette() or []
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([*(value for color in exact for value in color), *common[: 3 * count]])
+def lighter(png: bytes) -> bytes:
+    """A screenshot as a smaller PNG, without the lowest bit of its colours, which nobody sees."""
     out = io.BytesIO()
-    picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(out, "png", optimize=True)
+    Image.fromarray(np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) | 1).save(out, "png", optimize=True)
     return out.getvalue()
 
 

@@ -44,8 +44,6 @@ class Panel(BasePanel):
         assert hub.replay is not None
         gui, self._run, self._other = hub.server.gui, hub.replay.run, hub.replay.others[0]
         gui.add_html(figures_table(self._run, self._other))
-        colors = [(self._run.name, theme.ESTIMATE), (self._other.name, theme.OTHER)]
-        gui.add_html(theme.card(theme.legend(colors)))
         self._shown = (self._run.name, self._other.name) if self._run.name != self._other.name else ("First", "Second")
         self._mesh_of = gui.add_button_group("Mesh of", self._shown)
         self._past = Past(self._other.rows, self._other.trajectory)
@@ -68,7 +66,10 @@ def figures_table(a: Run, b: Run) -> str:
         for key, label, digits in _FIGURES
         if a.summary.get(key) is not None or b.summary.get(key) is not None
     )
-    names = f"<th></th><th>{escape(a.name)}</th><th>{escape(b.name)}</th>"
+    heads = ((a.name, theme.ESTIMATE), (b.name, theme.OTHER))
+    names = "<th></th>" + "".join(
+        f'<th style="border-bottom:3px solid {theme.css(color)}">{escape(name)}</th>' for name, color in heads
+    )
     return f'<div class="ec"><table><tr>{names}</tr>{rows}</table></div>'
 
 
