@@ -59,7 +59,9 @@ def test_every_tab_has_a_panel_and_no_two_share_a_place():
 
 
 def test_the_last_window_stays_on_the_page_between_two_mappings(engine, page):
-    mapped = replace(engine.skip_to(9).snapshot(), frame=10, window=(0, 5, 10), map_ms=80.0)
+    engine.skip_to(9)
+    assert until(lambda: page.hub.current is engine.latest())
+    mapped = replace(engine.snapshot(), frame=10, window=(0, 5, 10), map_ms=80.0)
     for s in (mapped, replace(mapped, frame=11, window=(), map_ms=0.0)):
         page.hub._take(s)
         assert until(lambda s=s: page.hub.current is not None and page.hub.current.frame == s.frame)
@@ -119,6 +121,30 @@ def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
             assert until(lambda label=label, value=value: control(page, label)[1].value == value), label
     finally:
         page.close()
+
+
+def test_the_slider_of_a_replay_follows_wherever_it_goes(replay_page):
+    slider = control(replay_page, "Frame")[1]
+    replay_page.engine.submit(m.RunTo(11))
+    assert until(lambda: slider.value == 12)
+    replay_page.engine.submit(m.Step())
+    assert until(lambda: slider.value == 13)
+    with dial(replay_page) as client:
+        enter(client)
+        assert until(lambda: list(replay_page.hub.viewers()))
+        press(replay_page, client, "Frame", 20)
+        assert until(lambda: replay_page.hub.current.frame == 19)
+        assert slider.value == 20
+    replay_page.engine.submit(m.Step())
+    assert until(lambda: slider.value == 21)
+
+
+def test_a_replay_shows_the_pictures_that_its_run_kept(replay_page, engine):
+    panel = next(p for p in replay_page.hub.panels if p.tab == "Pictures")
+    assert "kept no pictures" in panel._html.content
+    panel.snapshot(engine.skip_to(12).snapshot())
+    assert "Keyframe 11" in panel._html.content
+    assert "data:image/jpeg" in panel._html.content
 
 
 class _Hub:

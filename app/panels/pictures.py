@@ -33,7 +33,7 @@ class Panel(BasePanel):
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
         gui = hub.server.gui
-        self._html = gui.add_html(_message("No pictures yet."))
+        self._html = gui.add_html(_message("No pictures yet." if hub.replay is None else "This run kept no pictures."))
         self._asked, self._asked_frame, self._keyframe = 0.0, -1, False
         if hub.replay is None:
             self._live = gui.add_checkbox("Refresh while running", True)
@@ -41,6 +41,7 @@ class Panel(BasePanel):
 
     def snapshot(self, s: Snapshot) -> None:
         if self.hub.replay is not None:
+            self._show_kept(s)
             return
         due = time.monotonic() - self._asked > EVERY_S or s.state in (State.PAUSED, State.FINISHED)
         looked_at = self._live.value and not self._keyframe and bool(self.hub.server.get_clients())
@@ -62,6 +63,13 @@ class Panel(BasePanel):
         )
         if self.hub.replay is None:
             self.hub.submit(RequestPictures(keyframe.frame))
+
+    def _show_kept(self, s: Snapshot) -> None:
+        """Of a finished run there are its keyframes' pictures: show the newest one when that changes."""
+        newest = s.keyframes[-1] if s.keyframes else None
+        if newest is not None and newest.thumbnail and newest.frame != self._asked_frame:
+            self._asked_frame = newest.frame
+            self.keyframe(newest)
 
     def _show_current(self, event: object) -> None:
         self._keyframe = False
