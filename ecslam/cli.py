@@ -75,7 +75,9 @@ def run(
     resolved = resolve_config(preset or opened.preset, opened.layout, config, settings, seed, schedule)
     folder = out or Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}"
     offered = commands.offered(data or [])
-    engine = commands.make_engine(resolved, sequence, opened, folder, commands.pick_device(device), frames, offered)
+    engine = commands.make_engine(
+        resolved, sequence, opened, folder, commands.pick_device(device, resolved), frames, offered
+    )
     commands.start(engine, headless, host, port, not no_browser)
 
 

@@ -20,7 +20,7 @@ from .datasets.roots import sequences_under
 from .evaluation.trajectory_io import read_tum
 from .messages import Notice, Quit, Snapshot, State
 from .runtime.checkpoint import load_checkpoint
-from .runtime.driven import import_slam
+from .runtime.driven import estimate_mb, import_slam
 from .runtime.engine import Engine
 from .runtime.files import to_json, write_atomic
 from .runtime.judge import judge_run, read_mesh, read_truth
@@ -42,14 +42,15 @@ def open_sequence(address: str) -> Sequence:
     return datasets.open_sequence(address)
 
 
-def pick_device(name: str) -> str:
-    """``auto`` becomes cuda or cpu. Raises InputError for a device that is not there."""
+def pick_device(name: str, config: Config | None = None) -> str:
+    """``auto`` becomes cuda, or cpu where there is no GPU or too little free memory on it for ``config``. Raises
+    InputError for a device that is not there."""
     if name == "cpu" or (name == "auto" and not _may_have_cuda()):
         return "cpu"
     import torch
 
     if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        return "cuda" if torch.cuda.is_available() and _room_on_gpu(config) else "cpu"
     try:
         kind = torch.device(name).type
     except RuntimeError:
@@ -57,6 +58,20 @@ def pick_device(name: str) -> str:
     if kind == "cuda" and not torch.cuda.is_available():
         raise InputError(f"--device {name}: torch sees no CUDA GPU here; use --device cpu")
     return name
+
+
+def _room_on_gpu(config: Config | None) -> bool:
+    import torch
+
+    needed_mb = estimate_mb(config or Config())
+    try:
+        free_mb = torch.cuda.mem_get_info()[0] / 1e6
+    except RuntimeError as error:
+        console.print(f"note: the GPU cannot be used ({str(error).splitlines()[0]}); using the CPU", soft_wrap=True)
+        return False
+    if free_mb < needed_mb:
+        console.print(f"note: {free_mb:.0f} MB free on the GPU, about {needed_mb:.0f} MB needed; using the CPU")
+    return free_mb >= needed_mb
 
 
 def _may_have_cuda() -> bool:
@@ -120,20 +135,21 @@ def run_headless(engine: Engine) -> None:
         def show(s: Snapshot) -> None:
             nonlocal window
             window = len(s.window) or window
-            bar.update(task, description=progress_line(s, window))
+            bar.update(task, description=progress_line(s, window, wide=console.width >= 100))
 
         def tell(notice: Notice) -> None:
             if notice.level != "info" and engine.error is None:
-                where = "" if notice.frame is None else f"frame {notice.frame}: "
+                named = notice.frame is None or f"{notice.frame}" in notice.text
+                where = "" if named else f"frame {notice.frame}: "
                 bar.console.print(f"{notice.level}: {where}{notice.text}", soft_wrap=True, markup=False)
 
         summary = engine.run(show, tell)
     finish_run(engine.run_folder, summary)
 
 
-def progress_line(s: Snapshot, window: int) -> str:
+def progress_line(s: Snapshot, window: int, wide: bool = True) -> str:
     """The state of a run in a line. window: keyframes in the last bundle adjustment. loss: objective of the last
-    mapping; residual: of the frame's direct alignment."""
+    mapping; residual, where the line may be ``wide``: of the frame's direct alignment."""
     figures = [f"{s.state.value} {s.frame + 1}/{s.frames_total}", f"{s.fps_wall:.1f} frames/s"]
     if s.map_loss is not None:
         figures.append(f"loss {s.map_loss:.3f}")
@@ -141,7 +157,7 @@ def progress_line(s: Snapshot, window: int) -> str:
         figures.append(f"window {window}")
     if s.ate_cm is not None:
         figures.append(f"ATE {s.ate_cm:.2f} cm")
-    if "align_mm" in s.losses:
+    if wide and "align_mm" in s.losses:
         figures.append(f"residual {s.losses['align_mm']:.1f} mm")
     return "  ".join(figures)
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from ecslam import cli
+from ecslam import cli, commands
 from ecslam.commands import draw_picture
 from ecslam.config import apply_settings, load_config, load_preset
 from ecslam.datasets.meshes import load_mesh
@@ -256,6 +256,24 @@ def test_a_gpu_that_is_not_there(sequence, tmp_path):
     assert_refused(outcome, "--device cuda", "--device cpu")
 
 
+@pytest.mark.parametrize(
+    ("free", "device", "says"),
+    [
+        (lambda: (8e9, 9e9), "cuda", ""),
+        (lambda: (2e8, 9e9), "cpu", "200 MB free on the GPU"),
+        (mock.Mock(side_effect=RuntimeError("CUDA driver is too old\nmore")), "cpu", "CUDA driver is too old"),
+    ],
+)
+def test_an_automatic_choice_falls_back_to_the_cpu(monkeypatch, capsys, free, device, says):
+    monkeypatch.setattr(commands, "_may_have_cuda", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", free)
+    assert commands.pick_device("auto", load_preset("lite")) == device
+    out = capsys.readouterr().out
+    assert says in out
+    assert bool(out) == bool(says)
+
+
 @pytest.mark.parametrize("command", ["eval", "mesh", "resume"])
 def test_a_folder_that_holds_no_run(command, tmp_path):
     assert_refused(ecslam(command, tmp_path), str(tmp_path))
@@ -285,3 +303,21 @@ def test_help_names_every_command():
     text = ecslam("--help").out
     for command in ("run", "demo", "resume", "view", "eval", "mesh", "synth", "check", "bench"):
         assert f" {command} " in text
+
+
+def test_a_run_whose_sequence_has_moved_goes_on_where_it_is_now(sequence, tmp_path):
+    words = run_words(shutil.copytree(sequence, tmp_path / "room"), tmp_path / "run")
+    assert ecslam(*words, "--frames", "0:3").code == 0
+    (tmp_path / "run" / "summary.json").unlink()
+    (tmp_path / "room").rename(tmp_path / "elsewhere")
+    assert_refused(ecslam("resume", tmp_path / "run", "--headless"), str(tmp_path / "room"), "--sequence")
+    done = ecslam("resume", tmp_path / "run", "--headless", "--sequence", tmp_path / "elsewhere")
+    assert done.code == 0, done.err
+    assert summary(tmp_path / "run")["frames"] == 3
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["sequence"] == str(tmp_path / "elsewhere")
+
+
+def test_a_run_can_be_judged_from_another_folder(sequence, tmp_path, monkeypatch):
+    monkeypatch.chdir(sequence.parent)
+    assert ecslam(*run_words(Path(sequence.name), tmp_path / "run"), "--frames", "0:2").code == 0
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["sequence"] == str(sequence)

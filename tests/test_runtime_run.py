@@ -13,10 +13,11 @@ from fake_slam import QUICK, Behaviour, FakeSequence, circle, maker, open_fake
 from runtime_watch import running
 
 from ecslam.commands import progress_line
-from ecslam.config import load_config
+from ecslam.config import load_config, load_preset
 from ecslam.evaluation.trajectory import absolute_error
 from ecslam.messages import Notice, State
 from ecslam.runtime import engine as module
+from ecslam.runtime.driven import estimate_mb
 from ecslam.runtime.engine import Engine
 from ecslam.runtime.files import read_lines
 from ecslam.runtime.tally import Tally
@@ -329,3 +330,29 @@ def test_a_mesh_that_cannot_be_made_is_said(tmp_path, monkeypatch):
     summary = run(tmp_path)
     assert summary["frames"] == 30
     assert f"mesh.ply was not made; make it with: ecslam mesh {tmp_path}" in summary["warnings"]
+
+
+def test_a_gpu_without_memory_is_one_clear_line_with_what_the_preset_needs(tmp_path):
+    class OutOfMemoryError(RuntimeError):
+        """As torch names it."""
+
+    def step(self, frame, interrupt=None):
+        raise OutOfMemoryError("CUDA out of memory.\nTried to allocate 20 GiB")
+
+    make = maker()
+
+    def make_small(*args, **options):
+        slam = make(*args, **options)
+        slam.step = step.__get__(slam)
+        return slam
+
+    with pytest.raises(
+        InputError, match=r"cuda: out of memory; preset lite needs about \d{3,4} MB.*--device cpu"
+    ) as told:
+        run(tmp_path, make=make_small, device="cuda")
+    assert "\n" not in str(told.value)
+
+
+def test_the_estimate_of_memory_grows_with_the_preset():
+    live, lite, scannet = (estimate_mb(load_preset(name)) for name in ("live", "lite", "scannet"))
+    assert 500 < live < lite < scannet < 5000

@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 
 from ..config import Config
 from ..messages import StepReport
-from ..types import Frame, Intrinsics
+from ..types import Frame, InputError, Intrinsics
 
 State = dict[str, NDArray[Any]]
+
+BASE_MB = 600.0  # the library's own share, and the scene beside the map
+COPIES = 5  # of what is learnt: itself, its gradient, two moments, a frozen copy
 
 
 class Abandoned(Exception):
@@ -125,3 +128,22 @@ def make_slam(
     if state is not None:
         return Slam.restore(config, intrinsics, state, device=place)
     return Slam(config, intrinsics, device=place, bounds=bounds, first_pose=first_pose)
+
+
+def estimate_mb(config: Config) -> float:
+    """About how much memory of a GPU a run takes, in 10^6 bytes: what is learnt, and the samples of an iteration."""
+    field, sampling = config.field, config.sampling
+    learnt = 4 * COPIES * 2 * field.levels * 2**field.log2_table_size
+    rays = max(config.mapping.rays, config.tracking.rays)
+    each = 4 * (4 * field.levels + 6 * field.blob_bins + 128)
+    return BASE_MB + (learnt + each * rays * (sampling.uniform + sampling.near_depth)) / 1e6
+
+
+def out_of_memory(error: BaseException, config: Config, device: str) -> InputError | None:
+    """What to do about a GPU's lack of memory; None for any other error."""
+    if type(error).__name__ != "OutOfMemoryError":
+        return None
+    return InputError(
+        f"{device}: out of memory; preset {config.preset} needs about {estimate_mb(config):.0f} MB; free some, or "
+        "use --device cpu (ecslam resume goes on from the last checkpoint)"
+    )

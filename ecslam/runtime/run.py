@@ -22,7 +22,7 @@ from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
-from .driven import Abandoned, SlamFactory, SlamLike
+from .driven import Abandoned, SlamFactory, SlamLike, out_of_memory
 from .driven import State as Arrays
 from .meshjobs import MESH_POINTS, FrozenMap
 from .pictures import jpeg, shrink
@@ -165,9 +165,11 @@ class Run:
             self.slam = self.slam if self.tally.rows else None
             self._skip(index, str(error))
             return None
-        except BaseException:
+        except BaseException as error:
             self.torn = True
             self.tally.position = index
+            if (told := out_of_memory(error, self.config, self.plan.device)) is not None:
+                raise told from error
             raise
         self._record(report, item)
         return report
