@@ -229,12 +229,12 @@ class Hub:
             s, self._newest = self._newest, None
         if s is None:
             return
-        before, self.current = self.current, s
+        before = self.current
         restarted = before is not None and s.frame < before.frame and self.replay is None
         if before is None or restarted or before.sequence != s.sequence:
             self._begin(s)
         self.history.add_snapshot(s)
-        s = self.current = with_last_mapping(s, before)
+        self.current = s = with_last_mapping(s, before)
         with self.server.atomic():
             self.scene.update(s)
             for panel in self.panels:
