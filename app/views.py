@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 FOV_RAD = np.radians(50.0)
 GLIDE_S, GLIDE_STEPS_PER_S = 0.6, 30
+GLIDERS = 4  # with more viewers each one's camera jumps: thirty messages a second to each would cost the engine
 SETTLE_S = 1.0
 MOVED, WORTH_A_MOVE = 0.02, 0.12
 
@@ -69,7 +70,7 @@ class Views:
             position, look_at = self._all(client)
             away = max(np.linalg.norm(position - framing.position), np.linalg.norm(look_at - framing.look_at))
             if away > WORTH_A_MOVE * distance:
-                self.show_all(client, 2 * GLIDE_S)
+                self.show_all(client, 2 * GLIDE_S if len(clients) <= GLIDERS else 0.0)
 
     def reshaped(self, client: viser.ClientHandle) -> None:
         """A viewer's window has another shape: frame everything anew where the camera has been left to the page."""

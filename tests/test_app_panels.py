@@ -139,6 +139,22 @@ def test_the_slider_of_a_replay_follows_wherever_it_goes(replay_page):
     assert until(lambda: slider.value == 21)
 
 
+def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, page):
+    panel = next(p for p in page.hub.panels if p.tab == "Pictures")
+    s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)
+    pictures = m.FramePictures(9, *[np.zeros((2, 2, 3), np.uint8)] * 6)
+    with dial(page) as client:
+        enter(client)
+        assert until(lambda: list(page.hub.viewers()))
+        panel.snapshot(replace(s, frame=10))
+        panel._asked -= 2.0
+        panel.event(pictures)
+        assert 60 < panel._pause_s < 80
+        panel._asked -= 2.0
+        panel.event(pictures)
+        assert 60 < panel._pause_s < 80, "what somebody asked for says nothing about the time it takes"
+
+
 def test_a_replay_shows_the_pictures_that_its_run_kept(replay_page, engine):
     panel = next(p for p in replay_page.hub.panels if p.tab == "Pictures")
     assert "kept no pictures" in panel._html.content

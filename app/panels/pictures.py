@@ -14,7 +14,7 @@ from ecslam.messages import Event, FramePictures, KeyframeView, RequestPictures,
 from ..hub import Hub
 from ..panel import BasePanel
 
-EVERY_S = 3.0
+EVERY_S, SHARE = 3.0, 0.03  # seconds between two requests at least; of the engine's time at most
 _ORDER = (
     ("color", "colour"),
     ("depth", "depth"),
@@ -26,7 +26,7 @@ _ORDER = (
 
 
 class Panel(BasePanel):
-    """The pictures; the engine renders them between two frames, so it is asked every few seconds only."""
+    """The pictures; the engine renders them between two frames, so it is asked seldom, the slower it is the more so."""
 
     tab, order = "Pictures", 10
 
@@ -35,6 +35,7 @@ class Panel(BasePanel):
         gui = hub.server.gui
         self._html = gui.add_html(_message("No pictures yet." if hub.replay is None else "This run kept no pictures."))
         self._asked, self._asked_frame, self._keyframe = 0.0, -1, False
+        self._pause_s, self._waiting = EVERY_S, False
         if hub.replay is None:
             self._live = gui.add_checkbox("Refresh while running", True)
             hub.on(gui.add_button("Show current frame", color="gray"), self._show_current)
@@ -43,14 +44,16 @@ class Panel(BasePanel):
         if self.hub.replay is not None:
             self._show_kept(s)
             return
-        due = time.monotonic() - self._asked > EVERY_S or s.state in (State.PAUSED, State.FINISHED)
+        due = time.monotonic() - self._asked > self._pause_s or s.state in (State.PAUSED, State.FINISHED)
         looked_at = self._live.value and not self._keyframe and bool(self.hub.server.get_clients())
         if looked_at and due and s.keyframes and s.frame != self._asked_frame:
-            self._asked, self._asked_frame = time.monotonic(), s.frame
+            self._asked, self._asked_frame, self._waiting = time.monotonic(), s.frame, True
             self.hub.submit(RequestPictures())
 
     def event(self, event: Event) -> None:
         if isinstance(event, FramePictures):
+            if self._waiting:
+                self._pause_s, self._waiting = max(EVERY_S, (time.monotonic() - self._asked) / SHARE), False
             figures = "".join(_figure(getattr(event, field), name) for field, name in _ORDER)
             title = f"Keyframe {event.frame + 1}" if self._keyframe else f"Frame {event.frame + 1}"
             self._html.content = f'<div class="ec"><b>{title}</b><div class="ec-six">{figures}</div></div>'
