@@ -1,6 +1,7 @@
 """Every command does what it says; all are acknowledged at once, also in the middle of a long mapping."""
 
 import json
+import threading
 import time
 import zipfile
 from dataclasses import replace
@@ -14,6 +15,7 @@ from fake_slam import Behaviour, FakeSequence
 from runtime_watch import Watch, running
 
 from ecslam import config as configuration
+from ecslam.meshing import MeshingStopped
 from ecslam.messages import (
     Export,
     Exported,
@@ -281,3 +283,27 @@ def test_a_finished_run_still_exports_and_quits(tmp_path):
         watch.ask(Quit())
         assert engine.join(5)
         assert Watch(engine).ask(Pause()).error == "the engine has ended; start it again"
+
+
+def test_quitting_while_the_last_mesh_is_made_keeps_everything_else(tmp_path, monkeypatch):
+    begun = threading.Event()
+
+    def endless(frozen, voxel_m, max_triangles=0, should_stop=None):
+        begun.set()
+        while not should_stop():
+            time.sleep(0.005)
+        raise MeshingStopped
+
+    with running(tmp_path, FakeSequence(3), paused_at=2) as (engine, watch, _):
+        monkeypatch.setattr("ecslam.runtime.workshop.build_mesh", endless)
+        watch.ask(Resume())
+        assert begun.wait(10)
+        started = time.monotonic()
+        watch.ask(Quit())
+        assert engine.join(10)
+        assert time.monotonic() - started < 5
+    found = json.loads((tmp_path / "summary.json").read_text())
+    assert found["frames"] == 3
+    assert any("mesh.ply was not made" in text for text in found["warnings"])
+    assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 3
+    assert load_checkpoint(tmp_path / "checkpoints").frame == 3
