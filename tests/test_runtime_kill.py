@@ -72,7 +72,6 @@ def test_kill_at_any_moment_leaves_a_run_that_goes_on(tmp_path):
         assert kept == list(range(done))
 
 
-@pytest.mark.slow
 def test_a_kill_costs_at_most_ten_frames_where_they_take_over_three_seconds(tmp_path):
     process = start(tmp_path / "run", pause=0.35)
     try:

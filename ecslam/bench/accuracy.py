@@ -16,7 +16,6 @@ from ..runtime.judge import judge_run
 from ..types import InputError
 from .runs import Figures, in_own_process, preset_config, progress, say
 
-WHOLE = {"": ()}
 ABLATED: dict[str, tuple[str, ...]] = {
     "": (),
     " without FUS": ("fus=false",),
@@ -61,7 +60,8 @@ def bench_accuracy(
     variants = {
         preset + name: (preset, [*settings, *changes])
         for preset in presets
-        for name, changes in (ABLATED if ablate else WHOLE).items()
+        for name, changes in ABLATED.items()
+        if ablate or not name
     }
     for preset, changes in variants.values():
         apply_settings(preset_config(preset, opened), changes)
