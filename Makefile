@@ -42,6 +42,9 @@ $(VENV)/.ready: pyproject.toml | $(VENV)/bin/python
 	@echo "Setting up $(VENV) (a few minutes the first time) ..."
 	$(PIP) "torch>=2.10,<2.14"
 	$(PIP) -e .
+	@echo "Compiling the kernels for this machine ..."
+	@$(BIN)/ecslam run "synthetic/studio?size=80x60&frames=8" --preset live --headless --out $(VENV)/first-run >$(VENV)/first-run.log \
+		|| (cat $(VENV)/first-run.log && exit 1)
 	@touch $@
 
 $(VENV)/.ready-dev: pyproject.toml $(VENV)/.ready

@@ -130,7 +130,7 @@ def run_headless(engine: Engine) -> None:
     window = 0
     columns = (TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, refresh_per_second=4) as bar, quit_on_signals(engine):
-        task = bar.add_task("starting", total=None)
+        task = bar.add_task("starting; a first run compiles its kernels: half a minute", total=None)
 
         def show(s: Snapshot) -> None:
             nonlocal window

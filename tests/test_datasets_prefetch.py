@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from ecslam.datasets import prefetch
+from ecslam.datasets import Prefetch
 from ecslam.types import Frame, FrameError
 
 
@@ -40,7 +40,7 @@ class Probe:
 
 
 def run(probe: Probe, *args: object, **options: int) -> list[tuple[int, Frame | FrameError]]:
-    return list(prefetch(probe, *args, **options))  # type: ignore[arg-type]
+    return list(Prefetch(probe, *args, **options))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("workers", [1, 2, 4])
@@ -79,22 +79,22 @@ def test_an_error_stands_in_the_frames_place_and_the_rest_goes_on() -> None:
 
 def test_it_reads_no_further_ahead_than_it_may() -> None:
     probe = Probe(50)
-    frames = prefetch(probe, ahead=3)  # type: ignore[arg-type]
+    frames = Prefetch(probe, ahead=3)  # type: ignore[arg-type]
     for taken in range(5):
         next(frames)
         time.sleep(0.01)
         assert len(probe.read) <= taken + 1 + 3
-    frames.close()  # type: ignore[attr-defined]
+    frames.close()
 
 
 @pytest.mark.parametrize("taken", [0, 1, 7])
 def test_stopping_early_ends_all_threads_at_once(taken: int) -> None:
     before = threading.active_count()
     probe = Probe(1000, delay_s=0.002)
-    frames = prefetch(probe, ahead=100)  # type: ignore[arg-type]
+    frames = Prefetch(probe, ahead=100)  # type: ignore[arg-type]
     for _ in range(taken):
         next(frames)
-    frames.close()  # type: ignore[attr-defined]
+    frames.close()
     assert threading.active_count() == before
     assert len(probe.read) < 30
 
@@ -103,7 +103,7 @@ def test_an_exception_in_the_loop_body_leaves_no_thread_behind() -> None:
     before = threading.active_count()
 
     def loop() -> None:
-        for index, _ in prefetch(Probe(100, delay_s=0.001)):  # type: ignore[arg-type]
+        for index, _ in Prefetch(Probe(100, delay_s=0.001)):  # type: ignore[arg-type]
             if index == 3:
                 raise RuntimeError("mine")
 

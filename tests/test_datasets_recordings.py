@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ecslam.datasets import open_sequence, prefetch
+from ecslam.datasets import Prefetch, open_sequence
 from ecslam.datasets.check import check_sequence
 from ecslam.types import Frame
 
@@ -62,7 +62,7 @@ def test_check_finds_them_healthy(name: str, frames: int) -> None:
 
 def test_reading_ahead_gives_the_same_frames() -> None:
     sequence = open_sequence(recording("tum-fr1-xyz"))
-    for index, frame in prefetch(sequence, range(3)):
+    for index, frame in Prefetch(sequence, range(3)):
         assert isinstance(frame, Frame)
         np.testing.assert_array_equal(frame.color, sequence[index].color)
         np.testing.assert_array_equal(frame.depth, sequence[index].depth)

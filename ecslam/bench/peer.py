@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets import open_sequence, prefetch, select_frames
+from ..datasets import Prefetch, open_sequence, select_frames
 from ..evaluation.trajectory import absolute_error
 from ..types import Frame, Intrinsics
 
@@ -38,7 +38,7 @@ def measure_open3d(address: str, frames: str, device: str) -> dict[str, Any]:
     truth = sequence.poses_gt()
     model = DenseSlam(sequence.intrinsics, "CUDA:0" if device.startswith("cuda") else "CPU:0")
     started = perf_counter()
-    read = [(i, model.step(item)) for i, item in prefetch(sequence) if isinstance(item, Frame)]
+    read = [(i, model.step(item)) for i, item in Prefetch(sequence) if isinstance(item, Frame)]
     wall_s = perf_counter() - started
     rows, poses = [i for i, _ in read], np.stack([pose for _, pose in read])
     error = None if truth is None else absolute_error(poses, truth[rows])

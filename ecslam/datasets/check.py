@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Frame, FrameError, Intrinsics, Sequence
-from .prefetch import prefetch
+from .prefetch import Prefetch
 from .reading import finite_poses
 from .registry import open_sequence
 from .views import GAP_S, problems
@@ -84,7 +84,7 @@ def check_sequence(sequence: Sequence | str | Path, samples: int = 40) -> CheckR
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
     indices = np.unique(np.linspace(0, len(sequence) - 1, min(samples, len(sequence))).astype(int)).tolist()
-    depth, black, unreadable = _read_frames(result for _, result in prefetch(sequence, indices))
+    depth, black, unreadable = _read_frames(result for _, result in Prefetch(sequence, indices))
     poses = _pose_stats(sequence.poses_gt())
     return CheckReport(
         name=sequence.name,

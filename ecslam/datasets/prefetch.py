@@ -6,40 +6,57 @@ import os
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 
 from ..types import Frame, FrameError, Sequence
 
 MOST_WORKERS = 12
 
 
-def prefetch(
-    sequence: Sequence, indices: Iterable[int] | None = None, *, workers: int | None = None, ahead: int | None = None
-) -> Iterator[tuple[int, Frame | FrameError]]:
-    """Yield (index, frame) in the order of ``indices`` (default: all), with at most ``ahead`` frames read in advance.
+class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
+    """Yields (index, frame) in the order of ``indices`` (default: all), with at most ``ahead`` frames read in advance.
+    Reading begins at once.
 
     workers: threads, by default one a core within reason; ahead: by default two a worker.
-    Whatever goes wrong with one frame is yielded in its place as a FrameError and the rest goes on. Closing the
-    generator, or dropping it, cancels what has not begun and waits only for the reads under way.
+    Whatever goes wrong with one frame is yielded in its place as a FrameError and the rest goes on. ``close``, or
+    dropping the iterator, cancels what has not begun and waits only for the reads under way.
     """
-    workers = workers or min(max(os.cpu_count() or 1, 2), MOST_WORKERS)
-    ahead = 2 * workers if ahead is None else ahead
-    pending: deque[tuple[int, Future[Frame | FrameError]]] = deque()
-    with ThreadPoolExecutor(workers, thread_name_prefix="prefetch") as pool:
-        try:
-            for index in range(len(sequence)) if indices is None else indices:
-                pending.append((index, pool.submit(_read, sequence, index)))
-                if len(pending) > ahead:
-                    yield _result(pending)
-            while pending:
-                yield _result(pending)
-        finally:
-            for _, future in pending:
-                future.cancel()
 
+    def __init__(
+        self,
+        sequence: Sequence,
+        indices: Iterable[int] | None = None,
+        *,
+        workers: int | None = None,
+        ahead: int | None = None,
+    ) -> None:
+        workers = workers or min(max(os.cpu_count() or 1, 2), MOST_WORKERS)
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="prefetch")
+        self._sequence = sequence
+        self._coming = iter(range(len(sequence)) if indices is None else indices)
+        self._pending: deque[tuple[int, Future[Frame | FrameError]]] = deque()
+        self._read(2 * workers if ahead is None else ahead)
 
-def _result(pending: deque[tuple[int, Future[Frame | FrameError]]]) -> tuple[int, Frame | FrameError]:
-    index, future = pending.popleft()
-    return index, future.result()
+    def __next__(self) -> tuple[int, Frame | FrameError]:
+        self._read(1)
+        if not self._pending:
+            self.close()
+            raise StopIteration
+        index, future = self._pending.popleft()
+        return index, future.result()
+
+    def close(self) -> None:
+        """Stop reading; nothing more is yielded."""
+        self._pending.clear()
+        self._coming = iter(())
+        self._pool.shutdown(cancel_futures=True)
+
+    def __del__(self) -> None:
+        self.close()
+
+    def _read(self, count: int) -> None:
+        for index in islice(self._coming, count):
+            self._pending.append((index, self._pool.submit(_read, self._sequence, index)))
 
 
 def _read(sequence: Sequence, index: int) -> Frame | FrameError:

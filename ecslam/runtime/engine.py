@@ -32,6 +32,8 @@ from .workshop import Workshop
 CHECKPOINT_EVERY = 5
 WATCHED_PERIOD_S, UNWATCHED_PERIOD_S = 1 / 30, 1 / 4
 LONG_STEP_S = 0.5
+PATIENCE_S = 5.0
+PREPARING = "Preparing: the first run on a machine compiles its kernels, which takes up to half a minute"
 
 Items = Iterator[tuple[int, Frame | FrameError]]
 
@@ -39,10 +41,10 @@ Items = Iterator[tuple[int, Frame | FrameError]]
 class Engine:
     """An ``EngineHandle`` that runs ``Slam``.
 
-    sequence: an opened one or an address for ``open_sequence``; frames: ``A:B:STEP``, "" = all. out: the run folder.
-    sequences: addresses that ``Restart`` may ask for. checkpoint_every: fewest frames between checkpoints; what a kill
-    costs at most, see ``CheckpointWriter``. Raises InputError when the sequence cannot be opened or the folder not be
-    written to.
+    sequence: an opened one or an address for ``open_sequence``, read ahead from here on; frames: ``A:B:STEP``, "" =
+    all. out: the run folder. sequences: addresses that ``Restart`` may ask for. checkpoint_every: fewest frames between
+    checkpoints; what a kill costs at most, see ``CheckpointWriter``. Raises InputError when the sequence cannot be
+    opened or the folder not be written to.
     """
 
     def __init__(
@@ -188,19 +190,24 @@ class Engine:
             folder = RunFolder.create(plan.out, self._not_saved)
         else:
             folder = RunFolder.reopen(plan.out, resumed.frame, self._not_saved)
-        return Run(plan, folder, self._emit, self._make, self._checkpoint_every, resumed)
+        run = Run(plan, folder, self._emit, self._make, self._checkpoint_every, resumed)
+        self._ahead = datasets.Prefetch(plan.sequence, range(run.tally.position, len(plan.sequence)))
+        return run
 
     def _one_run(self) -> Turn:
         """From the first frame to the summary; what ended it."""
         run, turn = self._run, Turn.STOP
         self._workshop.begin(lambda: self._control.quitting)
         self._show(state_of(run))
-        frames = datasets.prefetch(run.plan.sequence, range(run.tally.position, len(run.plan.sequence)))
+        patience = threading.Timer(PATIENCE_S, self._ask_for_patience, (run,))
+        patience.daemon = True
+        patience.start()
         try:
-            with closing(frames):  # type: ignore[type-var]
+            with closing(self._ahead) as frames:
                 turn = self._frames(run, frames)
         except Exception as error:
             self._failed(error)
+        patience.cancel()
         self._control.end()
         try:
             self._finish(run, turn is Turn.STOP and self.error is None)
@@ -269,6 +276,10 @@ class Engine:
         self._workshop.keep(run)
         if monotonic() >= self._next_snapshot:
             self._show(state_of(run))
+
+    def _ask_for_patience(self, run: Run) -> None:
+        if run.report is None:
+            self._emit(Notice("info", PREPARING))
 
     def _failed(self, error: Exception) -> None:
         self.error = self.error or error

@@ -20,6 +20,7 @@ from .path import closed_path
 from .render import render
 from .rooms import Room
 from .scene import Scene, pack
+from .store import kept
 
 RATE_HZ = 30.0
 FOCAL = 0.8
@@ -39,11 +40,11 @@ def room(name: str) -> Room:
 @cache
 def _lit_scene(name: str) -> Scene:
     built = room(name)
-    return bake(pack(built.shapes), built.lights, built.interior)
+    return kept(name, lambda: bake(pack(built.shapes), built.lights, built.interior))
 
 
 def lit_scene(name: str) -> Scene:
-    """The room with textures and light, ready to render; made once, in a second or a few."""
+    """The room with textures and light, ready to render; made once, in a second or a few, and kept on disk."""
     with _baking:
         return _lit_scene(name)
 
