@@ -203,8 +203,10 @@ def parse_yaml(text: str, source: str) -> Any:
         )
     try:
         return yaml.load(text, _StrictLoader)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, TypeError) as error:
         raise InputError(f"{source}: not valid YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise InputError(f"{source}: nested too deeply for a configuration; is it the right file?") from None
 
 
 def config_folder() -> Path:

@@ -35,7 +35,7 @@ class FusedVolume:
         self, frame: Frame, camera: Intrinsics, c2w: NDArray[np.float64], near_m: float, far_m: float
     ) -> None:
         """Average a frame seen from c2w [4, 4] into the volume; depth outside near..far counts as none."""
-        depth = frame.depth * ((frame.depth >= near_m) & (frame.depth <= far_m))
+        depth = np.where((frame.depth >= near_m) & (frame.depth <= far_m), frame.depth, np.float32(0))
         light = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1 / 255)
         numbers = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         step = fusion.NORMAL_STRIDE

@@ -73,6 +73,12 @@ def test_scientific_notation_is_a_number():
         ("x" * 70_000, "KiB"),
         ("!!python/object/apply:os.system [true]", "not valid YAML"),
         ("- 1", "must hold keys"),
+        ("[" * 30_000, "nested too deeply"),
+        ("seed: " + "9" * 6000, "not valid YAML"),
+        ("seed: 2001-99-99", "not valid YAML"),
+        ("? [1]\n: 2", "not valid YAML"),
+        ("seed: !!int 'x'", "not valid YAML"),
+        ("truncation_m: !!float 'x'", "not valid YAML"),
     ],
 )
 def test_hostile_files_are_refused(text, says, tmp_path):

@@ -132,6 +132,14 @@ def test_repeated_and_backward_time_stamps_are_skipped(tmp_path):
     assert (np.diff(written) > 0).all()
 
 
+def test_a_time_stamp_far_in_the_future_costs_that_frame_only(tmp_path):
+    times = np.arange(20) / 10
+    times[6] += 1e6
+    summary = run(tmp_path, FakeSequence(20, times=times))
+    assert (summary["frames"], summary["skipped_frames"]) == (19, 1)
+    assert np.allclose(np.loadtxt(tmp_path / "trajectory.txt")[:, 0], np.delete(times, 6))
+
+
 def test_snapshots_keep_a_row_for_each_frame_and_say_lost(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "UNWATCHED_PERIOD_S", 0.0)
     seen = []

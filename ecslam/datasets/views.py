@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -79,6 +80,28 @@ def select_frames(sequence: Sequence, spec: str) -> Sequence:
             f"--frames {spec}: selects nothing of {sequence.name}, which has frames 0 .. {len(sequence) - 1}"
         )
     return SequenceView(sequence, np.array(chosen, np.int64))
+
+
+def in_order(timestamps: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """bool [N]: the frames to keep so that time always moves on and as few as possible are left out.
+
+    A longest rising subsequence (Schensted 1961), so that one stamp far in the future costs one frame. Of frames with
+    the same time the first stays.
+    """
+    ends: list[int] = []
+    times: list[float] = []
+    before = np.full(len(timestamps), -1)
+    for index, time in enumerate(timestamps.tolist()):
+        place = bisect_left(times, time)
+        if place < len(times) and times[place] == time:
+            continue
+        before[index] = ends[place - 1] if place else -1
+        ends[place : place + 1], times[place : place + 1] = [index], [time]
+    kept = np.zeros(len(timestamps), bool)
+    last = ends[-1] if ends else -1
+    while last >= 0:
+        kept[last], last = True, int(before[last])
+    return kept
 
 
 def problems(sequence: Sequence) -> list[str]:

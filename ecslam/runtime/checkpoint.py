@@ -22,7 +22,7 @@ from safetensors import SafetensorError
 from ..types import InputError
 from .files import to_json, write_atomic
 
-VERSION = 2
+VERSION = 3
 GENERATIONS = 2
 MAX_MANIFEST_BYTES = 16 << 20
 LASTING = "keyframes."

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .. import config as configuration
 from ..config import Config
 from ..datasets.check import odd_depth
-from ..datasets.views import problems
+from ..datasets.views import in_order, problems
 from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
 from ..messages import Event, LoopEvent, Notice, StepReport
@@ -69,6 +69,7 @@ class Run:
         self.tally = Tally(**resumed.meta["tally"]) if resumed else Tally()
         self.clock = Stopwatch(self.tally.wall_s)
         self.truth = _known(plan.sequence.poses_gt())
+        self._in_order = in_order(plan.sequence.timestamps())
         self.torn = False
         self.report: StepReport | None = None
         self.ate_cm: Spread | None = None
@@ -138,7 +139,7 @@ class Run:
     # ---- frames ---------------------------------------------------------------------------------------------------
 
     def feed(self, index: int, item: Frame | FrameError, interrupt: Callable[[], None]) -> StepReport | None:
-        """Process a frame, or skip it (None) when it is unreadable or does not move on in time.
+        """Process a frame, or skip it (None) when it is unreadable or out of order in time.
 
         Raises InputError when too many frames are unreadable, and whatever ``interrupt`` raises (the run is then
         ``torn``: the frame at work is lost and there are no more checkpoints).
@@ -151,10 +152,8 @@ class Run:
             self.tally.unreadable.append(str(item))
             self._skip(index, str(item))
             return None
-        last = self.tally.last_timestamp
-        if last is not None and item.timestamp <= last:
-            way = "repeats" if item.timestamp == last else "goes back in"
-            self._skip(index, f"frame {index} {way} time ({item.timestamp:.6f} s after {last:.6f} s)")
+        if not self._in_order[index]:
+            self._skip(index, f"frame {index} is not in the order of time ({item.timestamp:.6f} s)")
             return None
         if self._color is None and (odd := odd_depth(item.depth)):
             self.warn(odd, index)

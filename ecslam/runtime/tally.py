@@ -39,7 +39,6 @@ class Tally:
     wall_s: float = 0.0
     setup_s: float = 0.0
     engine_ms: float = 0.0
-    last_timestamp: float | None = None
 
     def add(self, report: StepReport) -> None:
         """Count a frame that was processed."""
@@ -48,7 +47,6 @@ class Tally:
         self.rows.append(report.frame)
         self.lost += report.lost
         self.loops += report.loop is not None
-        self.last_timestamp = report.timestamp
         if report.is_keyframe:
             self.keyframes.append(report.frame)
 
