@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-import resource
 import statistics
 import tempfile
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from ..datasets import open_sequence, select_frames
 from ..messages import Snapshot
 from ..runtime.checkpoint import load_checkpoint
 from ..runtime.engine import Engine
-from ..runtime.tally import peak_memory_mb
+from ..runtime.memory import resident_mb
 from .peer import measure_open3d, open3d_missing
 from .runs import in_own_process, preset_config, progress, say
 
@@ -103,7 +102,7 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
         with progress(preset) as show:
 
             def watch(snapshot: Snapshot) -> None:
-                memory[snapshot.frame] = _resident_mb()
+                memory[snapshot.frame] = resident_mb()
                 show(snapshot)
 
             summary = engine.run(watch)
@@ -199,14 +198,6 @@ def _growth(
         "keyframe_growth_mb": between_mb,
         "other_growth_mb": grown_mb - between_mb,
     }
-
-
-def _resident_mb() -> float:
-    """Memory of this process now; the most it has had where the system does not tell."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
-    except (OSError, IndexError, ValueError):
-        return peak_memory_mb()
 
 
 def _cell(value: float | None) -> str:

@@ -19,7 +19,7 @@ LIVE_PERIOD_S = 1.0
 LIVE_SHARE = 0.25
 LIVE_POINTS, MESH_POINTS = 200_000, 2_000_000
 FIRST_AFTER_S = 1.0
-FIRST_VOXEL_M = 0.08
+FIRST_VOXEL_M = 0.04
 FINEST_LIVE_VOXEL_M = 0.02
 BLOCK_M = 0.08
 
@@ -114,7 +114,7 @@ class JobThread:
 class LiveMeshes:
     """When the next mesh for the watchers is due, and how fine it is.
 
-    At most one a second, and so rarely that making them takes at most a quarter of the time; the first, coarse one a
+    At most one a second, and so rarely that making them takes at most a quarter of the time; the first one a
     second after the start; the voxel follows the triangle budget.
     """
 

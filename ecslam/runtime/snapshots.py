@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..messages import KeyframeView, Snapshot, State
-from .tally import peak_memory_mb
+from .memory import peak_memory_mb
 
 if TYPE_CHECKING:
     from .run import Run

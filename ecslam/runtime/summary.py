@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .tally import peak_memory_mb
+from .memory import peak_memory_mb
 
 if TYPE_CHECKING:
     from .run import Run

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
@@ -100,9 +98,3 @@ class Stopwatch:
     def resume(self) -> None:
         """Count again."""
         self._total_s, self._since = self.seconds, monotonic()
-
-
-def peak_memory_mb() -> float:
-    """The most memory this process has had so far, in 10^6 bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6

@@ -88,8 +88,9 @@ class Workshop:
             self._feed.publish(ready)
 
     def keep(self, run: Run) -> None:
-        """A few meshes over the run, for looking back later."""
-        if run.tally.position % -(-len(run.plan.sequence) // MESHES_KEPT) == 0:
+        """A few meshes over the run, for looking back later; the first after the first frame."""
+        done = run.tally.position
+        if done == 1 or done % -(-len(run.plan.sequence) // MESHES_KEPT) == 0:
             frozen = run.freeze(LIVE_POINTS)
             if frozen is not None:
                 name = f"meshes/{frozen.frame:06d}.ply"
