@@ -19,6 +19,7 @@ from . import kernels as seam
 from .align import LearnedSurface, Surface, align, cost_at, known_points
 from .config import Config
 from .field import TsdfField, box_of_points, create_field
+from .indices import evenly
 from .keyframes import Keyframe, make_keyframe, make_thumbnail, most_similar
 from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
@@ -170,7 +171,7 @@ class Slam:
         """Every part of the map gets its last iterations at a falling rate, not only what the last windows saw."""
         assert self.mapper is not None
         mapping = replace(self.config.mapping, newest_share=0.0, loss=self.config.mapping.final_loss)
-        rows = _spread(len(self.keyframes), mapping.rays // SETTLE_RAYS)
+        rows = evenly(len(self.keyframes), mapping.rays // SETTLE_RAYS)
         views, poses = [self.keyframes[i].pixels for i in rows], self.trajectory.keyframe_poses()[rows]
         fixed, config = np.ones(len(rows), bool), replace(self.config, mapping=mapping)
         self.mapper.run(views, poses, fixed, mapping.final_iterations, config, interrupt, settle=True)
@@ -389,11 +390,6 @@ def _around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     steps = np.concatenate([np.zeros((1, 6)), np.diag([AROUND_M] * 3 + [AROUND_RAD] * 3)])
     moves = torch.from_numpy(np.concatenate([steps, -steps[1:]]))
     return list(retract(torch.from_numpy(c2w).expand(len(moves), 4, 4), moves).numpy())
-
-
-def _spread(count: int, limit: int) -> NDArray[np.int64]:
-    """At most ``limit`` of ``count`` indices, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
 
 
 def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import WindowConfig
+from .indices import evenly
 
 RAYS_PER_KEYFRAME = 32
 
@@ -36,7 +37,7 @@ def select_window(
     recent = np.arange(count - min(config.recent, cap - 1), count)
     past = count - len(recent)
     room = min(config.historic, cap - len(recent))
-    historic = np.unique(np.linspace(0, past - 1, room).round().astype(np.int64)) if room else recent[:0]
+    historic = evenly(past, room)
     always = np.union1d(recent, historic)
     distance, angle = parallax(keyframes, current)
     order = np.lexsort((np.arange(count), distance))

@@ -26,8 +26,10 @@ def test_viewers_of_a_tiny_run(tmp_path, monkeypatch):
     assert result["viewers"] == 3
     assert len(result["fps_alone"]) == len(result["fps_watched"]) == 1
     assert min(result["fps_alone"]) > 0
+    assert 0 < result["first_mesh_s"] < result["first_map_s"]
     text = io.StringIO()
     viewers.print_result(result, Console(file=text, width=200))
     assert f"{result['ratio']:.2f} times" in text.getvalue()
+    assert f"first mesh {result['first_mesh_s']:.1f} s after the start" in text.getvalue()
     with pytest.raises(InputError, match="too short"):
         commands.bench_viewers(room, preset, "0:4", 3, 1, "cpu")

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,6 +122,34 @@ def test_a_sequence_without_a_usable_frame_is_an_error(tmp_path):
 
 def test_an_early_bad_stretch_does_not_end_the_run_before_ten_frames(tmp_path):
     assert run(tmp_path, FakeSequence(20, bad=(0, 1)))["frames"] == 18
+
+
+class Slow(FakeSequence):
+    """Its first frame waits for ``go``."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__(count)
+        self.go = threading.Event()
+
+    def __getitem__(self, index: int):
+        if index == 0:
+            self.go.wait(10)
+        return super().__getitem__(index)
+
+
+@pytest.mark.parametrize("patience_s", [0.0, 60.0])
+def test_a_first_frame_that_takes_long_is_explained_and_only_that(tmp_path, monkeypatch, patience_s):
+    monkeypatch.setattr(module, "PATIENCE_S", patience_s)
+    sequence, told = Slow(3), []
+
+    def tell(notice: Notice) -> None:
+        told.append(notice.text)
+        sequence.go.set()
+
+    if patience_s:
+        sequence.go.set()
+    engine(tmp_path, sequence).run(tell=tell)
+    assert told == ([] if patience_s else [module.PREPARING])
 
 
 def test_repeated_and_backward_time_stamps_are_skipped(tmp_path):

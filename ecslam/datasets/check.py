@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..indices import evenly
 from ..types import Frame, FrameError, Intrinsics, Sequence
 from .prefetch import Prefetch
 from .reading import finite_poses
@@ -83,7 +84,7 @@ def check_sequence(sequence: Sequence | str | Path, samples: int = 40) -> CheckR
     """Look a sequence over, reading at most ``samples`` frames spread over it. Raises InputError."""
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
-    indices = np.unique(np.linspace(0, len(sequence) - 1, min(samples, len(sequence))).astype(int)).tolist()
+    indices = evenly(len(sequence), samples).tolist()
     depth, black, unreadable = _read_frames(result for _, result in Prefetch(sequence, indices))
     poses = _pose_stats(sequence.poses_gt())
     return CheckReport(

@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ..indices import evenly
 from ..types import FrameError, InputError, Intrinsics
 from .images import read_header
 
@@ -102,7 +103,7 @@ def common_size(files: list[Path], samples: int = 9) -> tuple[int, int]:
     """The (width, height) that most of some spread files have, from headers alone. Raises InputError."""
     sizes: Counter[tuple[int, int]] = Counter()
     problem = ""
-    for i in np.linspace(0, len(files) - 1, min(samples, len(files))).astype(int):
+    for i in evenly(len(files), samples):
         try:
             sizes[read_header(files[i]).size] += 1
         except FrameError as error:

@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from ..indices import evenly
 from ..kernels.raster import in_sight, rasterize
 from ..types import Intrinsics, Mesh
 from .surface import part
@@ -30,9 +31,7 @@ DepthFunction = Callable[[int], NDArray[np.float32]]
 def spread_frames(poses: NDArray[np.float64], limit: int = 200) -> NDArray[np.int64]:
     """At most ``limit`` evenly spaced indices of the poses [N, 4, 4] that are finite."""
     finite = np.flatnonzero(np.isfinite(poses).all((1, 2)))
-    if len(finite) <= limit:
-        return finite
-    return finite[np.linspace(0, len(finite) - 1, limit).round().astype(np.int64)]
+    return finite[evenly(len(finite), limit)]
 
 
 def rendered_depth(mesh: Mesh, poses: NDArray[np.float64], intrinsics: Intrinsics) -> DepthFunction:

@@ -1,4 +1,4 @@
-"""The field at a chunk of points and its way back, jitted: what one thread does with data that fit its cache.
+"""The field at a chunk of points, jitted: what one thread does with data that fit its cache.
 
 Points lie structure-of-arrays, eight to a vector, ``pitch`` apart per component; hidden units lie 64 to a point. The
 one-blob encoding has three non-zero bins an axis, so the first layer sees 2 L + 9 inputs instead of 2 L + 3 bins.
@@ -11,40 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ._cpu_simd import (
-    floor,
-    fma,
-    gather,
-    highest,
-    isplat,
-    lanes,
-    load,
-    lowest,
-    make_tile,
-    power_of_two,
-    row_sums,
-    same_bits,
-    scatter_add,
-    slide,
-    splat,
-    store,
-    to_int,
-    transpose,
-    where_positive,
-)
+from ._cpu_math import BOTH, HALF, INNER, dots, sigmoid
+from ._cpu_simd import floor, fma, gather, highest, isplat, load, lowest, make_tile, splat, store, to_int
 
-OUTER = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "cache": True}
-INNER = {**OUTER, "cache": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-BOTH = 64
-HALF = 32
 BLOCK = 32  # points whose hidden units stay in the first-level cache through all passes
 P1, P2 = -1640531535, 805459861
 OFFSET, MASK, FIRST, DIMS = 0, 1, 2, 5
 ANCHOR, BLOB_LOW, BLOB_INV, LOW, HIGH = 0, 3, 6, 9, 12
 
 tile_relu = make_tile(4, 2, True, True)
-tile_set = make_tile(4, 2, False, False)
-tile_add = make_tile(4, 2, True, False)
 
 
 class Grid(NamedTuple):
@@ -327,65 +302,6 @@ def blob_layer(blob, bins, s, first, last, pitch):
 
 
 @njit(**INNER)
-def dot(a, i, b, j):
-    """Lane-wise partial sums of the dot product of two rows of 32."""
-    return (load(a, i) * load(b, j) + load(a, i + 8) * load(b, j + 8)) + (
-        load(a, i + 16) * load(b, j + 16) + load(a, i + 24) * load(b, j + 24)
-    )
-
-
-@njit(**INNER)
-def dots(a, i, b, j):
-    """Dot products of eight rows of 32, BOTH apart, with one row."""
-    return row_sums(
-        dot(a, i, b, j),
-        dot(a, i + BOTH, b, j),
-        dot(a, i + 2 * BOTH, b, j),
-        dot(a, i + 3 * BOTH, b, j),
-        dot(a, i + 4 * BOTH, b, j),
-        dot(a, i + 5 * BOTH, b, j),
-        dot(a, i + 6 * BOTH, b, j),
-        dot(a, i + 7 * BOTH, b, j),
-    )
-
-
-@njit(**INNER)
-def exp_parts(x):
-    """(2^k, e^r - 1) with e^x = 2^k e^r and |r| <= ln 2 / 2."""
-    x = lowest(highest(x, splat(np.float32(-87))), splat(np.float32(88)))
-    k = floor(x * splat(np.float32(1.4426950408889634)) + splat(np.float32(0.5)))
-    r = fma(k, splat(np.float32(-0.693145751953125)), x)
-    r = fma(k, splat(np.float32(-1.428606765330187e-06)), r)
-    q = fma(r, splat(np.float32(1 / 5040)), splat(np.float32(1 / 720)))
-    q = fma(r, q, splat(np.float32(1 / 120)))
-    q = fma(r, q, splat(np.float32(1 / 24)))
-    q = fma(r, q, splat(np.float32(1 / 6)))
-    q = fma(r, q, splat(np.float32(0.5)))
-    return power_of_two(k), fma(r * r, q, r)
-
-
-@njit(**INNER)
-def exp(x):
-    """e^x to about 1e-7."""
-    power, rest = exp_parts(x)
-    return fma(power, rest, power)
-
-
-@njit(**INNER)
-def expm1(x):
-    """e^x - 1, exact to rounding near 0 too."""
-    power, rest = exp_parts(x)
-    return fma(power, rest, power - splat(np.float32(1)))
-
-
-@njit(**INNER)
-def sigmoid(x):
-    """1 / (1 + e^-x)."""
-    one = splat(np.float32(1))
-    return one / (one + exp(splat(np.float32(0)) - x))
-
-
-@njit(**INNER)
 def decode(net, s, first, last, pitch):
     """TSDF and colour of points first..last from ``s.hidden``."""
     for p in range(first, last, 8):
@@ -408,177 +324,3 @@ def forward(grid, table, net, s, n, pitch, want_jac):
             for v in range(0, BOTH, 16):
                 tile_relu(s.hidden, BOTH * p + v, BOTH, s.enc, p, 1, pitch, net.features, v, BOTH, net.padded)
         decode(net, s, first, last, pitch)
-
-
-@njit(**INNER)
-def hidden_back(net, s, first, last, pitch, d_sdf, d_rgb):
-    """Turn hidden activations of points first..last into their gradients in place, from ``s.up``; adds the second
-    layer's gradients."""
-    for v in range(0, HALF, 8):
-        w, total = load(net.sdf, v), load(d_sdf, v)
-        for p in range(first, last):
-            h, g = load(s.hidden, BOTH * p + v), splat(s.up[p])
-            total = total + g * h
-            store(s.hidden, BOTH * p + v, where_positive(h, g * w))
-        store(d_sdf, v, total)
-    for v in range(0, HALF, 8):
-        wr, wg, wb = load(net.rgb, v), load(net.rgb, HALF + v), load(net.rgb, 2 * HALF + v)
-        tr, tg, tb = load(d_rgb, v), load(d_rgb, HALF + v), load(d_rgb, 2 * HALF + v)
-        for p in range(first, last):
-            h = load(s.hidden, BOTH * p + HALF + v)
-            r, g, b = splat(s.up[pitch + p]), splat(s.up[2 * pitch + p]), splat(s.up[3 * pitch + p])
-            tr, tg, tb = tr + r * h, tg + g * h, tb + b * h
-            store(s.hidden, BOTH * p + HALF + v, where_positive(h, r * wr + g * wg + b * wb))
-        store(d_rgb, v, tr)
-        store(d_rgb, HALF + v, tg)
-        store(d_rgb, 2 * HALF + v, tb)
-
-
-@njit(**INNER)
-def features_back(net, s, first, last, pitch, begin, end):
-    """Gradients of the hash features of points first..last from hidden units begin..end, into ``s.d_enc``."""
-    padded = net.padded
-    for p in range(first, last, 8):
-        for i in range(0, 8, 4):
-            for v in range(0, padded, 16):
-                tile_set(
-                    s.turn, i * padded + v, padded, s.hidden, BOTH * (p + i) + begin, BOTH, 1,
-                    net.features_t, begin * padded + v, padded, end - begin,
-                )  # fmt: skip
-        for v in range(0, padded, 8):
-            transpose(s.turn, v, padded, s.d_enc, v * pitch + p, pitch)
-
-
-@njit(**INNER)
-def blob_back(blob, bins, s, p, pitch, begin, end):
-    """Derivatives of one point's TSDF and colour along the three axes through the one-blob inputs: their lane-wise
-    partial sums go to ``s.turn`` [3, 8, 8]."""
-    i = BOTH * s.bin[p]
-    j = BOTH * (s.bin[pitch + p] + bins + 2)
-    k = BOTH * (s.bin[2 * pitch + p] + 2 * (bins + 2))
-    a, b, c = splat(s.slope[p]), splat(s.slope[2 * pitch + p]), splat(s.slope[4 * pitch + p])
-    d, e, f = splat(s.slope[pitch + p]), splat(s.slope[3 * pitch + p]), splat(s.slope[5 * pitch + p])
-    x = y = z = splat(np.float32(0))
-    for v in range(begin, end, 8):
-        g = load(s.hidden, BOTH * p + v)
-        x = x + g * (a * load(blob, i + v) + d * load(blob, i + v + BOTH))
-        y = y + g * (b * load(blob, j + v) + e * load(blob, j + v + BOTH))
-        z = z + g * (c * load(blob, k + v) + f * load(blob, k + v + BOTH))
-    at = 8 * (p & 7)
-    store(s.turn, at, x)
-    store(s.turn, at + 64, y)
-    store(s.turn, at + 128, z)
-
-
-@njit(**INNER)
-def eight_sums(a, i):
-    """The sums of eight consecutive rows of eight."""
-    return row_sums(
-        load(a, i), load(a, i + 8), load(a, i + 16), load(a, i + 24),
-        load(a, i + 32), load(a, i + 40), load(a, i + 48), load(a, i + 56),
-    )  # fmt: skip
-
-
-@njit(**INNER)
-def points_back(grid, net, s, first, last, pitch, begin, end):
-    """Position gradients of points first..last, into ``s.d_x``, from ``s.d_enc`` and hidden units begin..end."""
-    features, jac = 2 * grid.levels.shape[0], net.padded * pitch
-    for p in range(first, last, 8):
-        x = y = z = splat(np.float32(0))
-        for i in range(p, p + features * pitch, pitch):
-            g = load(s.d_enc, i)
-            x = x + g * load(s.jac, i)
-            y = y + g * load(s.jac, i + jac)
-            z = z + g * load(s.jac, i + 2 * jac)
-        for q in range(p, p + 8):
-            blob_back(net.blob_steps, grid.bins, s, q, pitch, begin, end)
-        x, y, z = x + eight_sums(s.turn, 0), y + eight_sums(s.turn, 64), z + eight_sums(s.turn, 128)
-        store(s.d_x, p, x * load(s.inside, p))
-        store(s.d_x, pitch + p, y * load(s.inside, pitch + p))
-        store(s.d_x, 2 * pitch + p, z * load(s.inside, 2 * pitch + p))
-
-
-@njit(**INNER)
-def weights_back(grid, net, s, first, last, pitch, d_features, d_blob):
-    """Add the first layer's gradients from points first..last: d_features [padded, 64], d_blob [3, bins + 2, 64]."""
-    for v in range(0, BOTH, 16):
-        for i in range(0, net.padded, 4):
-            tile_add(
-                d_features, BOTH * i + v, BOTH, s.enc, i * pitch + first, pitch, 1,
-                s.hidden, BOTH * first + v, BOTH, last - first,
-            )  # fmt: skip
-    for axis in range(3):
-        for v in range(0, BOTH, 16):
-            blob_weights_back(s, first, last, pitch, axis, v, d_blob[axis * (grid.bins + 2) * BOTH :])
-
-
-@njit(**INNER)
-def blob_weights_back(s, first, last, pitch, axis, v, d_blob):
-    """Sixteen columns of ``weights_back`` for one axis: neighbours share their bins, so sums stay in registers."""
-    zero = splat(np.float32(0))
-    a0 = a1 = b0 = b1 = c0 = c1 = zero
-    last_bin = s.bin[axis * pitch + first]
-    for p in range(first, last):
-        own = s.bin[axis * pitch + p]
-        if own != last_bin:
-            add_sums(d_blob, BOTH * last_bin + v, a0, a1, b0, b1, c0, c1)
-            a0 = a1 = b0 = b1 = c0 = c1 = zero
-            last_bin = own
-        g0, g1 = load(s.hidden, BOTH * p + v), load(s.hidden, BOTH * p + v + 8)
-        at = 3 * axis * pitch + p
-        a, b, c = splat(s.coef[at]), splat(s.coef[at + pitch]), splat(s.coef[at + 2 * pitch])
-        a0, a1, b0, b1, c0, c1 = a0 + a * g0, a1 + a * g1, b0 + b * g0, b1 + b * g1, c0 + c * g0, c1 + c * g1
-    add_sums(d_blob, BOTH * last_bin + v, a0, a1, b0, b1, c0, c1)
-
-
-@njit(**INNER)
-def add_sums(target, at, a0, a1, b0, b1, c0, c1):
-    """Add sixteen columns of three rows, BOTH apart."""
-    store(target, at, load(target, at) + a0)
-    store(target, at + 8, load(target, at + 8) + a1)
-    at += BOTH
-    store(target, at, load(target, at) + b0)
-    store(target, at + 8, load(target, at + 8) + b1)
-    at += BOTH
-    store(target, at, load(target, at) + c0)
-    store(target, at + 8, load(target, at + 8) + c1)
-
-
-@njit(**INNER)
-def table_back(grid, level, x, d_enc, n, pitch, rows, parts, d_table):
-    """Add one level's rows of the table gradient from a chunk of points: x [6, pitch], d_enc [padded, pitch].
-
-    Neighbours on a ray often share a cell: their sums stay in registers, one lane per corner, until the cell changes.
-    rows: int32 [3, 64] and parts: float32 [24] are scratch.
-    """
-    zero = splat(np.float32(0))
-    ux, uy, uz = lanes(-1, 1, -1, 1, -1, 1, -1, 1), lanes(-1, -1, 1, 1, -1, -1, 1, 1), lanes(-1, -1, -1, -1, 1, 1, 1, 1)
-    bx, by, bz = lanes(1, 0, 1, 0, 1, 0, 1, 0), lanes(1, 1, 0, 0, 1, 1, 0, 0), lanes(1, 1, 1, 1, 0, 0, 0, 0)
-    last_x, last_y, last_z = isplat(-(2**31)), isplat(-(2**31)), isplat(-(2**31))
-    sum_a, sum_b = zero, zero
-    run, live = 0, False
-    at_a, at_b = 2 * level * pitch, (2 * level + 1) * pitch
-    for p in range(0, n, 8):
-        ix, iy, iz, fx, fy, fz = locate(grid, level, x, p, pitch)
-        corners(grid.levels, level, ix, iy, iz, rows)
-        own = 64 + 8 * (p & 8)
-        transpose(rows, 0, 8, rows, own, 8)
-        store(parts, 0, fx)
-        store(parts, 8, fy)
-        store(parts, 16, fz)
-        same = same_bits(slide(last_x, ix), ix) & same_bits(slide(last_y, iy), iy) & same_bits(slide(last_z, iz), iz)
-        last_x, last_y, last_z = ix, iy, iz
-        for i in range(8):
-            if live and not (same >> i) & 1:
-                scatter_add(d_table, rows, run, sum_a, sum_b)
-                live = False
-            a, b = d_enc[at_a + p + i], d_enc[at_b + p + i]
-            if a == 0 and b == 0:
-                continue
-            if not live:
-                live, sum_a, sum_b = True, zero, zero
-            run = own + 8 * i
-            w = (bx + ux * splat(parts[i])) * (by + uy * splat(parts[8 + i])) * (bz + uz * splat(parts[16 + i]))
-            sum_a, sum_b = sum_a + w * splat(a), sum_b + w * splat(b)
-    if live:
-        scatter_add(d_table, rows, run, sum_a, sum_b)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ._cpu_field import INNER, OUTER, exp, expm1, sigmoid
+from ._cpu_math import INNER, OUTER, exp, expm1, sigmoid
 from ._cpu_simd import load, splat, store
 
 FREE, CENTRE, TAIL, DEPTH_UNIFORM, DEPTH_FEATURE, COLOUR_UNIFORM, COLOUR_FEATURE, TRUNCATION, CENTRE_SHARE = range(9)

@@ -8,22 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ._cpu_field import (
-    BLOCK,
-    BOTH,
-    HALF,
-    INNER,
-    MASK,
-    OFFSET,
-    OUTER,
-    carve,
-    features_back,
-    forward,
-    hidden_back,
-    points_back,
-    table_back,
-    weights_back,
-)
+from ._cpu_back import features_back, hidden_back, points_back, table_back, weights_back
+from ._cpu_field import BLOCK, MASK, OFFSET, carve, forward
+from ._cpu_math import BOTH, HALF, INNER, OUTER
 from ._cpu_rays import compare, composite, pose_sums, rendered, sample_points
 from ._cpu_simd import fetch_add
 

@@ -21,7 +21,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ._cpu_field import BOTH, HALF, Grid, Net, scratch_floats
+from ..compiled import drop_stale
+from ._cpu_field import Grid, Net, scratch_floats
+from ._cpu_math import BOTH, HALF
 from ._cpu_rays import Rays, count_rays, pose_gradients
 from ._cpu_work import (
     add_partials,
@@ -35,16 +37,7 @@ from ._cpu_work import (
 )
 from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
 
-
-def _drop_stale_cache() -> None:
-    """numba renews compiled code when the file of the entry function changes, not when that of a callee does."""
-    newest = max(path.stat().st_mtime for path in Path(__file__).parent.glob("_cpu_*.py"))
-    for index in Path(step_worker.stats.cache_path).glob("_cpu_*.nbi"):
-        if index.stat().st_mtime < newest:
-            index.unlink(missing_ok=True)
-
-
-_drop_stale_cache()
+drop_stale(Path(__file__).parent, step_worker.stats.cache_path, "_cpu_*")
 
 CHUNK_POINTS = 256
 CHUNK_RAYS = 8

@@ -9,7 +9,6 @@ from time import monotonic
 
 from .checkpoint import Checkpoint, Stored, save_checkpoint
 from .files import remove_temporaries
-from .memory import give_back
 
 PATIENCE_S = 3.0
 SHARE = 0.05
@@ -77,6 +76,5 @@ class CheckpointWriter:
             self._failed(error)
         else:
             self._saved()
-        give_back()
         self._settled, self._settled_s = checkpoint.frame, self._begun_s
         self._cost_s = self._now() - self._begun_s

@@ -1,4 +1,4 @@
-"""How much memory this process has, and giving back what it no longer uses."""
+"""How much memory this process has, and giving back what it has freed."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import ctypes
 import resource
 import sys
 from pathlib import Path
+
+M_MMAP_THRESHOLD = -3
+LARGE = 2 << 20
 
 
 def peak_memory_mb() -> float:
@@ -22,8 +25,12 @@ def resident_mb() -> float:
         return peak_memory_mb()
 
 
-def give_back() -> None:
-    """Return to the system what large jobs have freed, which glibc keeps otherwise. Takes milliseconds."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
+def return_large_blocks() -> None:
+    """From now on give every freed block of ``LARGE`` bytes or more back to the system at once.
+
+    glibc raises this limit to 32 MB by itself, and then keeps the holes that meshes and checkpoints leave: 100 MB of
+    them in a run of the studio. Concerns the whole process; does nothing on other systems.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, LARGE)

@@ -109,6 +109,8 @@ class JobThread:
                 pass
             except Exception as error:
                 self._failed(error)
+            finally:
+                del job  # it holds a map
 
 
 class LiveMeshes:

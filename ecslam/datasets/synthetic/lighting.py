@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence as Many
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ...compiled import drop_stale
 from .scene import ALBEDO, GLOW, LIGHT_SIZE, LIGHT_START, Scene
 from .shapes import BOX, Light
 from .solids import FAR, FAST, ONE, ZERO, F, enter, lean, normal, scalar
@@ -211,3 +213,6 @@ def _bounce(numbers, values, local, light, k, x, y, z):
     b = MIDDLE + MIDDLE * (py / hy if face >= 4 else pz / hz)
     r, g, bl = irradiance(numbers, light, at(k), face, a, b)
     return r * values[k, ALBEDO], g * values[k, ALBEDO + 1], bl * values[k, ALBEDO + 2]
+
+
+drop_stale(Path(__file__).parent, _direct.stats.cache_path)

@@ -1,0 +1,11 @@
+"""Choosing some of many."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def evenly(count: int, limit: int) -> NDArray[np.int64]:
+    """At most ``limit`` of the indices 0 .. ``count`` - 1, evenly spread, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))

@@ -1,0 +1,36 @@
+"""Memory: what was freed goes back to the system, among small things that stay."""
+
+import subprocess
+import sys
+
+import pytest
+
+from ecslam.runtime.memory import peak_memory_mb, resident_mb
+
+HOLES = """
+import numpy as np
+from ecslam.runtime.memory import resident_mb, return_large_blocks
+if {wanted}:
+    return_large_blocks()
+np.ones(30 << 20, np.uint8)
+before = resident_mb()
+blocks, small = [], []
+for _ in range(40):
+    blocks.append(np.ones(3 << 20, np.uint8))
+    small.append(np.ones(100 << 10, np.uint8))
+held = resident_mb() - before
+del blocks
+print(held, resident_mb() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems return memory by their own rules")
+def test_holes_go_back_to_the_system():
+    program = [sys.executable, "-c", HOLES.format(wanted=True)]
+    held, left = map(float, subprocess.run(program, capture_output=True, text=True, check=True).stdout.split())
+    assert held > 120
+    assert left < 20
+
+
+def test_resident_memory_is_below_its_peak():
+    assert 10 < resident_mb() <= peak_memory_mb() + 1
