@@ -121,6 +121,14 @@ def best_side(mesh: Mesh, up: Array, before: Array | None = None) -> Array:
     return np.asarray(sides[0] if before is not None and area[0] > 0.75 * area.max() else sides[np.argmax(area)])
 
 
+def distance_to_path(point: Array, path: Array) -> float:
+    """How far a point [3] lies from the polyline through path [n, 3]."""
+    start, along = path[:-1], np.diff(path, axis=0)
+    length = np.maximum((along**2).sum(1), 1e-12)
+    share = np.clip(((point - start) * along).sum(1) / length, 0, 1)
+    return float(np.linalg.norm(start + share[:, None] * along - point, axis=1).min())
+
+
 def behind(c2w: Array, up: Array, distance: float = 1.1) -> tuple[Array, Array]:
     """A viewing position just behind and above a camera, and the point it looks at."""
     centre, forward = c2w[:3, 3], c2w[:3, 2]

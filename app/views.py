@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from dataclasses import dataclass
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from .geometry import behind, overview
+from .geometry import behind, distance_to_path, overview
 from .scene import Scene
 
 Array = NDArray[np.float64]
@@ -18,23 +17,23 @@ Array = NDArray[np.float64]
 FOV_RAD = np.radians(50.0)
 GLIDE_S, GLIDE_STEPS_PER_S = 0.6, 30
 GLIDERS = 4  # with more viewers each one's camera jumps: thirty messages a second to each would cost the engine
-SETTLE_S = 1.0
 MOVED, WORTH_A_MOVE = 0.02, 0.12
+REMEMBERED = 8
 
 
 @dataclass(frozen=True)
 class _Framing:
-    """What the page has done for a viewer. until: when its glide and the browser's echo of it are over."""
+    """Where the page has put a viewer's camera. way: [k, 3] the places on the way there, the last one ``position``."""
 
     position: Array
     look_at: Array
-    until: float
+    way: Array
 
     def left(self, client: viser.ClientHandle) -> bool:
-        """Whether the viewer has taken the camera elsewhere."""
+        """Whether the viewer has taken the camera off the way; however late a browser reports, it reports places on
+        it."""
         distance = np.linalg.norm(self.position - self.look_at)
-        moved = np.linalg.norm(client.camera.position - self.position)
-        return time.monotonic() >= self.until and bool(moved > MOVED * distance)
+        return distance_to_path(np.array(client.camera.position), self.way) > MOVED * distance
 
 
 class Views:
@@ -55,7 +54,10 @@ class Views:
     def show_all(self, client: viser.ClientHandle, seconds: float = GLIDE_S) -> None:
         """Bring everything into one viewer's sight, and keep it there as the map grows."""
         place = self._all(client)
-        self._framed[client.client_id] = _Framing(*place, time.monotonic() + seconds + SETTLE_S)
+        framing = self._framed.get(client.client_id)
+        before = [] if framing is None or framing.left(client) else list(framing.way)
+        way = np.stack([*before, np.array(client.camera.position), place[0]])
+        self._framed[client.client_id] = _Framing(*place, way[-REMEMBERED:])
         self._fly(client, *place, seconds)
 
     def keep_framed(self) -> None:

@@ -14,7 +14,6 @@ BOX = np.array(np.meshgrid([-2.0, 2], [-2.0, 2], [0.0, 2])).reshape(3, -1).T
 
 @pytest.fixture
 def page(tmp_path, monkeypatch):
-    monkeypatch.setattr(views, "SETTLE_S", -10.0)
     monkeypatch.setattr(views, "GLIDE_S", 0.05)
     engine = FakeEngine(tmp_path / "run", frames=60)
     page = server.start(engine, port=0)
@@ -76,6 +75,22 @@ def test_who_has_moved_the_camera_keeps_it(page, viewer):
     page.hub.post(lambda: page.hub.views.show_all(client))
     assert until(lambda: np.linalg.norm(client.camera.position) > 5)
     assert client.client_id in page.hub.views._framed, "the page frames it again"
+
+
+def test_a_browser_that_reports_late_has_not_moved_the_camera(page, viewer):
+    connection, client = viewer
+    first = np.array(client.camera.position)
+    grow(page, 2)
+    assert until(lambda: np.linalg.norm(client.camera.position) > 1.5 * np.linalg.norm(first))
+    second = page.hub.views._framed[client.client_id].position
+    halfway = (first + second) / 2
+    for late in (first, halfway):
+        say(connection, "ViewerCameraMessage", **{**CAMERA, "position": late.tolist()})
+        assert until(lambda late=late: np.allclose(client.camera.position, late))
+        grow(page, 2)
+        assert client.client_id in page.hub.views._framed
+    grow(page, 4)
+    assert until(lambda: np.linalg.norm(client.camera.position) > 1.5 * np.linalg.norm(second))
 
 
 def test_flying_to_a_keyframe_ends_the_framing(page, viewer):
