@@ -130,7 +130,7 @@ def run_headless(engine: Engine) -> None:
     window = 0
     columns = (TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, refresh_per_second=4) as bar, quit_on_signals(engine):
-        task = bar.add_task("starting; a first run compiles its kernels: half a minute", total=None)
+        task = bar.add_task("starting", total=None)
 
         def show(s: Snapshot) -> None:
             nonlocal window
@@ -138,7 +138,7 @@ def run_headless(engine: Engine) -> None:
             bar.update(task, description=progress_line(s, window, wide=console.width >= 100))
 
         def tell(notice: Notice) -> None:
-            if notice.level != "info" and engine.error is None:
+            if (notice.level != "info" or notice.frame is None) and engine.error is None:
                 named = notice.frame is None or f"{notice.frame}" in notice.text
                 where = "" if named else f"frame {notice.frame}: "
                 bar.console.print(f"{notice.level}: {where}{notice.text}", soft_wrap=True, markup=False)

@@ -152,6 +152,13 @@ def test_a_first_frame_that_takes_long_is_explained_and_only_that(tmp_path, monk
     assert told == ([] if patience_s else [module.PREPARING])
 
 
+def test_a_first_mapping_that_is_under_way_is_not_explained(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "PATIENCE_S", 0.2)
+    told = []
+    engine(tmp_path, FakeSequence(2), Behaviour(first_interrupts=10, pause_s=0.05)).run(tell=told.append)
+    assert told == []
+
+
 def test_repeated_and_backward_time_stamps_are_skipped(tmp_path):
     times = np.arange(20) / 10
     times[5], times[9], times[10] = times[4], 0.1, times[8]

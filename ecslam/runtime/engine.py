@@ -71,6 +71,7 @@ class Engine:
         self._open_sequence, self._make, self._checkpoint_every = open_sequence, make, checkpoint_every
         self._feed = Feed()
         self._next_snapshot = 0.0
+        self._signs_of_life = 0
         self._progress: Callable[[Snapshot], None] = lambda snapshot: None
         self._tell: Callable[[Notice], None] = lambda notice: None
         self._thread: threading.Thread | None = None
@@ -201,7 +202,8 @@ class Engine:
         run, turn = self._run, Turn.STOP
         self._workshop.begin(lambda: self._control.quitting)
         self._show(state_of(run))
-        patience = threading.Timer(PATIENCE_S, self._ask_for_patience, (run,))
+        self._signs_of_life = 0
+        patience = threading.Timer(PATIENCE_S, self._ask_for_patience)
         patience.daemon = True
         patience.start()
         try:
@@ -279,8 +281,9 @@ class Engine:
         if monotonic() >= self._next_snapshot:
             self._show(state_of(run))
 
-    def _ask_for_patience(self, run: Run) -> None:
-        if run.report is None:
+    def _ask_for_patience(self) -> None:
+        """Before the second iteration of the first mapping, when all kernels that it takes have been compiled."""
+        if self._signs_of_life < 2:
             self._emit(Notice("info", PREPARING))
 
     def _failed(self, error: Exception) -> None:
@@ -305,6 +308,7 @@ class Engine:
 
     def _in_between(self, run: Run) -> None:
         """What can be done between frames and in the middle of a long mapping."""
+        self._signs_of_life += 1
         self._workshop.take_up(run, self._control.take_work((RequestMesh,)))
         self._workshop.live(run)
 
