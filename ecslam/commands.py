@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from . import datasets
+from .atomic import write_atomic
 from .config import Config
 from .datasets.roots import sequences_under
 from .evaluation.trajectory_io import read_tum
@@ -22,7 +23,7 @@ from .messages import Notice, Quit, Snapshot, State
 from .runtime.checkpoint import load_checkpoint
 from .runtime.driven import estimate_mb, import_slam
 from .runtime.engine import Engine
-from .runtime.files import to_json, write_atomic
+from .runtime.files import to_json
 from .runtime.judge import judge_run, read_mesh, read_truth
 from .runtime.mesh_files import mesh_bytes
 from .runtime.meshjobs import MESH_POINTS, FrozenMap, build_mesh

@@ -17,7 +17,7 @@ else:
 ROOT = Path(__file__).parent.parent
 LAYERS = (
     ("types", "messages", "config"),
-    ("rigid", "indices", "compiled"),
+    ("rigid", "indices", "compiled", "atomic"),
     ("se3",),
     ("kernels",),
     ("field",),
@@ -31,7 +31,7 @@ LAYERS = (
     ("cli",),
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
-GROUND = {"types", "messages", "config", "indices", "compiled"}
+GROUND = {"types", "messages", "config", "indices", "compiled", "atomic"}
 
 
 def module_name(path: Path) -> str:

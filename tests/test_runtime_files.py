@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from ecslam.atomic import write_atomic
 from ecslam.messages import Notice
 from ecslam.runtime import files
-from ecslam.runtime.files import LineLog, keep_lines, read_lines, require_space, to_json, write_atomic
+from ecslam.runtime.files import LineLog, keep_lines, read_lines, require_space, to_json
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.runtime.runfolder import RunFolder
 from ecslam.types import InputError, Mesh

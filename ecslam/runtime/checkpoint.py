@@ -19,8 +19,9 @@ import safetensors.numpy
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
+from ..atomic import write_atomic
 from ..types import InputError
-from .files import to_json, write_atomic
+from .files import to_json
 
 VERSION = 3
 GENERATIONS = 2

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from time import monotonic
 
+from ..atomic import remove_temporaries
 from .checkpoint import Checkpoint, Stored, save_checkpoint
-from .files import remove_temporaries
 
 PATIENCE_S = 3.0
 SHARE = 0.05

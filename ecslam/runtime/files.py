@@ -1,52 +1,16 @@
-"""Files that survive a full disk and a kill at any moment: atomic replacement, and logs of one JSON object a line."""
+"""Files that survive a full disk and a kill at any moment: room for them, and logs of one JSON object a line."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from ..atomic import write_atomic
 from ..types import InputError
-
-_TEMPORARY = ".tmp"
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Replace ``path`` by ``data``: whenever a crash comes, it holds either the old or the new bytes.
-
-    Raises OSError, with no temporary file left behind.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}{_TEMPORARY}")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames in ``folder`` survive a power cut, where the system can do that."""
-    if os.name == "posix":
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-def remove_temporaries(folder: Path) -> None:
-    """Delete what interrupted ``write_atomic`` calls left in ``folder``."""
-    for path in folder.glob(f".*{_TEMPORARY}"):
-        path.unlink(missing_ok=True)
 
 
 def require_space(folder: Path, needed_mb: float) -> None:

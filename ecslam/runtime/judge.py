@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import datasets
+from ..atomic import write_atomic
 from ..datasets.meshes import load_mesh
 from ..evaluation.trajectory import absolute_error, relative_error
 from ..evaluation.trajectory_io import read_tum
 from ..types import InputError, Mesh
-from .files import write_atomic
 
 
 def judge_run(

@@ -33,9 +33,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..atomic import remove_temporaries, write_atomic
 from ..messages import LoopEvent, Notice, StepReport
 from ..types import InputError
-from .files import LineLog, keep_lines, read_lines, remove_temporaries, require_space, to_json, write_atomic
+from .files import LineLog, keep_lines, read_lines, require_space, to_json
 
 NEEDED_MB = 500.0
 LOGS = ("metrics.jsonl", "events.jsonl", "keyframes.jsonl")

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import os
 import zipfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 
 import numpy as np
 
+from ...atomic import write_atomic
 from .scene import Scene
 
 
@@ -34,15 +35,9 @@ def kept(name: str, bake: Callable[[], Scene]) -> Scene:
 
 def _save(path: Path, scene: Scene) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        try:
-            np.savez(file, **scene._asdict())
-            file.close()
-            os.replace(file.name, path)
-        except BaseException:
-            file.close()
-            os.unlink(file.name)
-            raise
+    data = io.BytesIO()
+    np.savez(data, **scene._asdict())
+    write_atomic(path, data.getvalue())
     for older in path.parent.glob(f"{path.name.partition('-')[0]}-*.npz"):
         if older != path:
             older.unlink(missing_ok=True)
