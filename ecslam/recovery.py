@@ -22,6 +22,7 @@ MAX_STEP_M = 0.5
 MAX_TURN_DEG = 35.0
 SEARCH_POINTS, SEARCH_POSES, SEARCH_KEPT, SEARCH_FOUND, SEARCH_ROUNDS = 300, 600, 30, 3, 5
 SEARCH_M, SEARCH_RAD = 0.2, 0.25
+AROUND_M, AROUND_RAD = 0.1, 0.1
 
 
 class Recovery:
@@ -59,6 +60,13 @@ class Recovery:
             return False
         step = float(np.linalg.norm(track.c2w[:3, 3] - last[:3, 3]))
         return step < MAX_STEP_M and float(rotation_angle_deg(last, track.c2w)) < MAX_TURN_DEG
+
+
+def around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The pose [4, 4] and those a step or a turn away along each axis: where to look for a camera after a gap."""
+    steps = np.concatenate([np.zeros((1, 6)), np.diag([AROUND_M] * 3 + [AROUND_RAD] * 3)])
+    moves = torch.from_numpy(np.concatenate([steps, -steps[1:]]))
+    return list(retract(torch.from_numpy(c2w).expand(len(moves), 4, 4), moves).numpy())
 
 
 def best_start(

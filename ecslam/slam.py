@@ -26,9 +26,8 @@ from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
 from .observed import ObservedVoxels
 from .pixels import Pixels, choose_pixels, spread_pixels
-from .recovery import Recovery, best_start, search
+from .recovery import Recovery, around, best_start, search
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
-from .se3 import retract
 from .tracker import TrackResult, fit, track_adam, track_direct
 from .trajectory import Trajectory
 from .types import Frame, FrameError, InputError, Intrinsics
@@ -42,7 +41,6 @@ WORSE = 1.02  # a rendered pose may cost this much more on the aligned surface, 
 RELOCALISE_FROM = 5
 GAP_S = 1.0
 OUTSIDE_SHARE = 0.01
-AROUND_M, AROUND_RAD = 0.1, 0.1
 RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
 SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
 
@@ -186,7 +184,7 @@ class Slam:
         usable = len(measured.points()) >= LEAST_POINTS
         track = TrackResult(guess, {}, 0.0)
         if usable:
-            starts = _around(guess) if gap else [guess]
+            starts = around(guess) if gap else [guess]
             track = best_start(lambda start: self._track_from(frame, measured, start), starts)
         return self._recovery.judge(
             track, self.trajectory[-1], lambda: self._relocalise(frame, measured) if usable else None
@@ -383,13 +381,6 @@ class Slam:
     def _require_field(self) -> TsdfField:
         assert self._frozen is not None
         return self._frozen
-
-
-def _around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The pose [4, 4] and those a step or a turn away along each axis: where to look for a camera after a gap."""
-    steps = np.concatenate([np.zeros((1, 6)), np.diag([AROUND_M] * 3 + [AROUND_RAD] * 3)])
-    moves = torch.from_numpy(np.concatenate([steps, -steps[1:]]))
-    return list(retract(torch.from_numpy(c2w).expand(len(moves), 4, 4), moves).numpy())
 
 
 def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:

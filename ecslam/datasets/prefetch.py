@@ -35,10 +35,10 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
         self._sequence = sequence
         self._coming = iter(range(len(sequence)) if indices is None else indices)
         self._pending: deque[tuple[int, Future[Frame | FrameError]]] = deque()
-        self._read(2 * workers if ahead is None else ahead)
+        self._submit(2 * workers if ahead is None else ahead)
 
     def __next__(self) -> tuple[int, Frame | FrameError]:
-        self._read(1)
+        self._submit(1)
         if not self._pending:
             self.close()
             raise StopIteration
@@ -54,7 +54,7 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
     def __del__(self) -> None:
         self.close()
 
-    def _read(self, count: int) -> None:
+    def _submit(self, count: int) -> None:
         for index in islice(self._coming, count):
             self._pending.append((index, self._pool.submit(_read, self._sequence, index)))
 
