@@ -81,8 +81,9 @@ def test_a_browser_that_reports_late_has_not_moved_the_camera(page, viewer):
     connection, client = viewer
     first = np.array(client.camera.position)
     grow(page, 2)
-    assert until(lambda: np.linalg.norm(client.camera.position) > 1.5 * np.linalg.norm(first))
     second = page.hub.views._framed[client.client_id].position
+    assert np.linalg.norm(second) > 1.5 * np.linalg.norm(first)
+    assert until(lambda: np.allclose(client.camera.position, second)), "the glide is over"
     halfway = (first + second) / 2
     for late in (first, halfway):
         say(connection, "ViewerCameraMessage", **{**CAMERA, "position": late.tolist()})
