@@ -166,7 +166,7 @@ class ReplayEngine:
             trajectory_gt=run.trajectory_gt,
             keyframes=keyframes,
             window=tuple(mapped.get("window") or ()),
-            color=_decoded(keyframes[-1].thumbnail) if keyframes else None,
+            color=_decoded(keyframes[-1].jpeg()) if keyframes else None,
             fov_y_rad=run.fov_y_rad,
             aspect=run.aspect,
             losses=dict(row.get("losses") or {}),

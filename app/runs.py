@@ -152,11 +152,9 @@ def _keyframes(folder: Path, rows: tuple[dict[str, Any], ...], trajectory: Array
     return tuple(out)
 
 
-def _picture(folder: Path, name: Any) -> bytes:
-    path = folder / str(name or "")
-    if not name or not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
-        return b""
-    return path.read_bytes()
+def _picture(folder: Path, name: Any) -> str:
+    path = (folder / str(name or "")).resolve()
+    return str(path) if path.is_relative_to(folder.resolve()) and path.is_file() else ""
 
 
 def _loop_event(row: dict[str, Any]) -> LoopEvent:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from .pixels import Pixels, choose_pixels
 from .types import Frame, Intrinsics
 
 THUMBNAIL = (40, 30)
+BLOCK, ALIGNMENT = 4 << 20, 64  # bytes
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,28 @@ class Keyframe:
     frame: int
     pixels: Pixels
     thumbnail: NDArray[np.float32]
+
+
+class Shelf:
+    """Keeps the arrays of keyframes side by side in large blocks of memory: each for itself would lie among what the
+    engine needs for a moment, and pin the gaps."""
+
+    def __init__(self) -> None:
+        self._free = np.empty(0, np.uint8)
+
+    def keep(self, keyframe: Keyframe) -> Keyframe:
+        """The same keyframe, its arrays moved here."""
+        pixels = Pixels(*(self._put(getattr(keyframe.pixels, f.name)) for f in fields(Pixels)))
+        return Keyframe(keyframe.frame, pixels, self._put(keyframe.thumbnail))
+
+    def _put(self, array: NDArray[Any]) -> NDArray[Any]:
+        size = -(-array.nbytes // ALIGNMENT) * ALIGNMENT
+        if size > len(self._free):
+            self._free = np.empty(max(size, BLOCK), np.uint8)
+        kept = self._free[: array.nbytes].view(array.dtype).reshape(array.shape)
+        self._free = self._free[size:]
+        kept[...] = array
+        return kept
 
 
 def make_keyframe(frame: Frame, camera: Intrinsics, config: Config, rng: np.random.Generator) -> Keyframe:

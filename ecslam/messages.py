@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,12 +81,19 @@ class StepReport:
 
 @dataclass(frozen=True)
 class KeyframeView:
-    """A keyframe as the world sees it. c2w: float64 [4, 4]; thumbnail: a JPEG at most 160 px wide, empty where there
-    is none."""
+    """A keyframe as the world sees it. c2w: float64 [4, 4]; picture: where a JPEG at most 160 px wide lies, if it could
+    be saved."""
 
     frame: int
     c2w: NDArray[np.float64]
-    thumbnail: bytes
+    picture: str
+
+    def jpeg(self) -> bytes:
+        """The picture's file, empty where there is none."""
+        try:
+            return Path(self.picture).read_bytes() if self.picture else b""
+        except OSError:
+            return b""
 
 
 @dataclass(frozen=True)

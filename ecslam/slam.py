@@ -20,7 +20,7 @@ from .align import LearnedSurface, Surface, align, cost_at, known_points
 from .config import Config
 from .field import TsdfField, box_of_points, create_field
 from .indices import evenly
-from .keyframes import Keyframe, make_keyframe, make_thumbnail, most_similar
+from .keyframes import Keyframe, Shelf, make_keyframe, make_thumbnail, most_similar
 from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
@@ -66,6 +66,7 @@ class Slam:
         self.kernels_name, self._kernels, self.kernels_note = seam.select(self.device)
         self.trajectory = Trajectory()
         self.keyframes: list[Keyframe] = []
+        self._shelf = Shelf()
         self.mapper: Mapper | None = None
         self._first_pose = np.eye(4) if first_pose is None else np.array(first_pose, np.float64)
         box = config.field.box
@@ -99,7 +100,8 @@ class Slam:
         tracked = time.perf_counter()
         losses, loop = track.losses, None
         if keyframe:
-            self.keyframes.append(make_keyframe(frame, self.intrinsics, self.config, self._rng))
+            keyframe_now = make_keyframe(frame, self.intrinsics, self.config, self._rng)
+            self.keyframes.append(self._shelf.keep(keyframe_now))
         if keyframe and index % self.config.mapping.every == 0:
             losses, loop = self._map(frame.index, interrupt)
         return StepReport(
@@ -129,7 +131,7 @@ class Slam:
         self.mapper = Mapper(field, self._kernels, self.config.seed)
         self._frozen = field
         self.trajectory.append(self._first_pose, frame.timestamp, True, keyframe=True)
-        self.keyframes.append(keyframe)
+        self.keyframes.append(self._shelf.keep(keyframe))
         self._window = np.array([0])
         try:
             result = self._optimise(np.array([0]), self.config.mapping.first_iterations, interrupt)

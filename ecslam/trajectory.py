@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from . import se3
+
+ROOM = 64
 
 
 class Trajectory:
@@ -14,44 +18,44 @@ class Trajectory:
     def __init__(self) -> None:
         self.timestamps: list[float] = []
         self.tracked: list[bool] = []
-        self._keyframes: list[NDArray[np.float64]] = []
-        self._anchor: list[int] = []
-        self._relative: list[NDArray[np.float64]] = []
+        self._count = self._keyframe_count = 0
+        self._keyframes, self._relative = np.empty((ROOM, 4, 4)), np.empty((ROOM, 4, 4))
+        self._anchor = np.empty(ROOM, np.int64)
 
     def __len__(self) -> int:
-        return len(self._anchor)
+        return self._count
 
     def __getitem__(self, index: int) -> NDArray[np.float64]:
         """Pose [4, 4] of one frame."""
-        return self._keyframes[self._anchor[index]] @ self._relative[index]
+        index = range(self._count)[index]
+        return np.asarray(self._keyframes[self._anchor[index]] @ self._relative[index])
 
     def append(self, c2w: NDArray[np.float64], timestamp: float, tracked: bool, keyframe: bool) -> None:
         """Add a frame. The first one must be a keyframe."""
         if keyframe:
-            self._keyframes.append(se3.orthonormalise(c2w))
-        self._anchor.append(len(self._keyframes) - 1)
-        self._relative.append(se3.orthonormalise(se3.inverse(self._keyframes[-1]) @ c2w))
+            self._keyframes = _with_room(self._keyframes, self._keyframe_count)
+            self._keyframes[self._keyframe_count] = se3.orthonormalise(c2w)
+            self._keyframe_count += 1
+        self._relative = _with_room(self._relative, self._count)
+        self._anchor = _with_room(self._anchor, self._count)
+        self._anchor[self._count] = self._keyframe_count - 1
+        self._relative[self._count] = se3.orthonormalise(se3.inverse(self._keyframes[self._anchor[self._count]]) @ c2w)
+        self._count += 1
         self.timestamps.append(timestamp)
         self.tracked.append(tracked)
 
     def keyframe_poses(self) -> NDArray[np.float64]:
         """Poses [K, 4, 4] of the keyframes."""
-        return np.stack(self._keyframes) if self._keyframes else np.empty((0, 4, 4))
+        return self._keyframes[: self._keyframe_count].copy()
 
     def move_keyframes(self, index: NDArray[np.int64], c2w: NDArray[np.float64]) -> None:
         """Set keyframe poses [K, 4, 4] at ``index`` [K]; the frames that hang on them follow."""
         for i, pose in zip(index.tolist(), c2w, strict=True):
             self._keyframes[i] = se3.orthonormalise(pose)
 
-    def move_last(self, c2w: NDArray[np.float64]) -> None:
-        """Set the pose of the newest frame relative to its keyframe."""
-        self._relative[-1] = se3.orthonormalise(se3.inverse(self._keyframes[self._anchor[-1]]) @ c2w)
-
     def poses(self) -> NDArray[np.float64]:
         """Poses [N, 4, 4] of all frames."""
-        if not self._anchor:
-            return np.empty((0, 4, 4))
-        return np.stack(self._keyframes)[self._anchor] @ np.stack(self._relative)
+        return np.asarray(self._keyframes[self._anchor[: self._count]] @ self._relative[: self._count])
 
     def predict(self) -> NDArray[np.float64]:
         """Constant-velocity guess [4, 4] for the next frame."""
@@ -65,8 +69,8 @@ class Trajectory:
             "timestamps": np.asarray(self.timestamps, np.float64),
             "tracked": np.asarray(self.tracked, np.uint8),
             "keyframes": self.keyframe_poses(),
-            "anchor": np.asarray(self._anchor, np.int64),
-            "relative": np.stack(self._relative) if self._relative else np.empty((0, 4, 4)),
+            "anchor": self._anchor[: self._count].copy(),
+            "relative": self._relative[: self._count].copy(),
         }
 
     @classmethod
@@ -75,7 +79,14 @@ class Trajectory:
         self = cls()
         self.timestamps = [float(t) for t in state["timestamps"]]
         self.tracked = [bool(t) for t in state["tracked"]]
-        self._keyframes = [np.array(k, np.float64) for k in state["keyframes"]]
-        self._anchor = [int(a) for a in state["anchor"]]
-        self._relative = [np.array(r, np.float64) for r in state["relative"]]
+        self._keyframes, self._relative = (np.array(state[name], np.float64) for name in ("keyframes", "relative"))
+        self._anchor = np.array(state["anchor"], np.int64)
+        self._count, self._keyframe_count = len(self._anchor), len(self._keyframes)
         return self
+
+
+def _with_room(rows: NDArray[Any], used: int) -> NDArray[Any]:
+    """The same rows, with room for one more than the ``used`` ones: doubled when there is none."""
+    return (
+        rows if used < len(rows) else np.concatenate([rows, np.empty((max(used, ROOM), *rows.shape[1:]), rows.dtype)])
+    )

@@ -97,11 +97,6 @@ def picture(frame: int, tint: float = 0.0) -> np.ndarray:
     return np.clip(np.stack([red, green, blue], -1) + tint, 0, 255).astype(np.uint8)
 
 
-@lru_cache(2000)
-def thumbnail(frame: int) -> bytes:
-    return jpeg(picture(frame)[::2, ::2])
-
-
 class FakeEngine:
     """``period`` seconds a frame; ``busy`` seconds in which commands are only acknowledged (a long mapping)."""
 
@@ -197,13 +192,20 @@ class FakeEngine:
         poses[:, :3, :3] = spin[:, :3, :3] @ poses[:, :3, :3]
         return poses
 
+    def _thumbnail(self, frame: int) -> str:
+        path = self.run_folder / "thumbnails" / f"{frame:06d}.jpg"
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(jpeg(picture(frame)[::2, ::2]))
+        return str(path)
+
     def publish(self):
         self._feed.publish(self.snapshot())
 
     def snapshot(self) -> m.Snapshot:
         i = max(self._frame, 0)
         poses = self._estimate(i)
-        keys = tuple(m.KeyframeView(k, poses[k], thumbnail(k)) for k in range(0, i + 1, 5))
+        keys = tuple(m.KeyframeView(k, poses[k], self._thumbnail(k)) for k in range(0, i + 1, 5))
         old = (0, 5, 10, 15, 20) if self._loops and i - self._loops[-1].frame < 20 else ()
         window = (*old, *(k.frame for k in keys[-5:] if k.frame not in old))
         error = 100 * np.linalg.norm(poses[:, :3, 3] - self._gt[: i + 1, :3, 3], axis=1)

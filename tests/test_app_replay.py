@@ -168,7 +168,7 @@ def test_thumbnail_outside_the_run_is_not_read(folder, tmp_path):
     for name in ("metrics.jsonl", "summary.json"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     (tmp_path / "keyframes.jsonl").write_text(json.dumps({"frame": 0, "thumbnail": "../../../../etc/hostname"}) + "\n")
-    assert not load_run(tmp_path).keyframes[0].thumbnail
+    assert not load_run(tmp_path).keyframes[0].picture
 
 
 def test_runs_on_different_sequences_are_not_compared(folder, tmp_path):

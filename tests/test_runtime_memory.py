@@ -31,5 +31,25 @@ def test_holes_go_back_to_the_system():
     assert left < 20
 
 
+GAPS = """
+import numpy as np
+from ecslam.runtime.memory import resident_mb, return_holes
+blocks, small = [], []
+for _ in range(400):
+    blocks.append(np.ones(100 << 10, np.uint8))
+    small.append(np.ones(1 << 10, np.uint8))
+before = resident_mb()
+del blocks
+return_holes()
+print(before - resident_mb())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems return memory by their own rules")
+def test_gaps_between_small_blocks_go_back_when_asked():
+    program = [sys.executable, "-c", GAPS]
+    assert float(subprocess.run(program, capture_output=True, text=True, check=True).stdout) > 30
+
+
 def test_resident_memory_is_below_its_peak():
     assert 10 < resident_mb() <= peak_memory_mb() + 1

@@ -60,7 +60,8 @@ class Panel(BasePanel):
 
     def keyframe(self, keyframe: KeyframeView) -> None:
         self._keyframe = True
-        figure = _image(keyframe.thumbnail, "colour") if keyframe.thumbnail else ""
+        jpeg = keyframe.jpeg()
+        figure = _image(jpeg, "colour") if jpeg else ""
         self._html.content = (
             f'<div class="ec"><b>Keyframe {keyframe.frame + 1}</b><div class="ec-six">{figure}</div></div>'
         )
@@ -70,7 +71,7 @@ class Panel(BasePanel):
     def _show_kept(self, s: Snapshot) -> None:
         """Of a finished run there are its keyframes' pictures: show the newest one when that changes."""
         newest = s.keyframes[-1] if s.keyframes else None
-        if newest is not None and newest.thumbnail and newest.frame != self._asked_frame:
+        if newest is not None and newest.picture and newest.frame != self._asked_frame:
             self._asked_frame = newest.frame
             self.keyframe(newest)
 

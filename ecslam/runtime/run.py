@@ -24,6 +24,7 @@ from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
 from .driven import Abandoned, SlamFactory, SlamLike, out_of_memory
 from .driven import State as Arrays
+from .memory import return_holes
 from .meshjobs import MESH_POINTS, FrozenMap
 from .pictures import jpeg, shrink
 from .runfolder import RunFolder
@@ -32,6 +33,7 @@ from .tally import Stopwatch, Tally
 
 ATE_EVERY = 10
 TRAJECTORY_EVERY = 100
+TRIM_EVERY = 25
 THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
@@ -83,7 +85,6 @@ class Run:
             saved=lambda: folder.found("checkpoints"),
             frame=self.tally.position,
         )
-        self.thumbnails: dict[int, bytes] = {}
         self._color: NDArray[np.uint8] | None = None
         self.lost_for = 0
         self._settled = False
@@ -92,7 +93,7 @@ class Run:
             self._settled = bool(resumed.meta["finished"])
             self._build(None, resumed.arrays)
             self._require_same_times()
-            self.thumbnails, self.loops = folder.thumbnails(), folder.loops()
+            self.loops = folder.loops()
         else:
             self._describe()
 
@@ -234,8 +235,7 @@ class Run:
         if len(self.tally.rows) % ATE_EVERY == 0:
             self.measure()
         if report.is_keyframe:
-            self.thumbnails[report.frame] = jpeg(shrink(frame.color, THUMBNAIL_WIDTH))
-            self.folder.keyframe(report.frame, report.c2w, self.thumbnails[report.frame])
+            self.folder.keyframe(report.frame, report.c2w, jpeg(shrink(frame.color, THUMBNAIL_WIDTH)))
         self.folder.metrics(report, self.ate_cm.rmse if self.ate_cm else None, self._window_poses(report))
         if report.loop is not None:
             self.loops.append(report.loop)
@@ -249,6 +249,8 @@ class Run:
             self.checkpoint()
         if len(self.tally.rows) % TRAJECTORY_EVERY == 0:
             self.write_trajectory()
+        if len(self.tally.rows) % TRIM_EVERY == 0:
+            return_holes()
 
     def configure(self, config: Config) -> None:
         """Other tracking and mapping settings from the next frame on."""

@@ -129,9 +129,13 @@ class RunFolder:
         kind = "loop" if isinstance(event, LoopEvent) else "notice"
         self._append("events.jsonl", {"type": kind} | {f.name: getattr(event, f.name) for f in fields(event)})
 
+    def picture(self, frame: int) -> str:
+        """The path of a keyframe's picture."""
+        return f"{self.path}/{_thumbnail(frame)}"
+
     def keyframe(self, frame: int, c2w: NDArray[np.float64], thumbnail: bytes) -> None:
         """Log a keyframe and save its picture, a JPEG."""
-        name = f"thumbnails/{frame:06d}.jpg"
+        name = _thumbnail(frame)
         try:
             (self.path / name).write_bytes(thumbnail)
         except OSError as error:
@@ -145,12 +149,6 @@ class RunFolder:
             return dict(about)
         except (OSError, ValueError, TypeError):
             raise InputError(f"{self.path / 'run.json'}: missing or damaged; start again with ecslam run") from None
-
-    def thumbnails(self) -> dict[int, bytes]:
-        """The saved keyframe pictures, by frame; those that are still there."""
-        lines = read_lines(self.path / "keyframes.jsonl")
-        paths = {int(line["frame"]): self.path / line["thumbnail"] for line in lines}
-        return {frame: path.read_bytes() for frame, path in paths.items() if path.is_file()}
 
     def loops(self) -> list[LoopEvent]:
         """The loop closures in the log."""
@@ -176,3 +174,7 @@ class RunFolder:
                 log.close()
             except OSError as error:
                 self.missing(name, error)
+
+
+def _thumbnail(frame: int) -> str:
+    return f"thumbnails/{frame:06d}.jpg"

@@ -37,7 +37,7 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
         trajectory=poses[tally.row_of_each_frame()] if len(poses) else poses,
         trajectory_gt=run.truth,
         keyframes=tuple(
-            KeyframeView(frame, c2w, run.thumbnails.get(frame, b""))
+            KeyframeView(frame, c2w, run.folder.picture(frame))
             for frame, c2w in zip(frames, keyframe_poses, strict=True)
         ),
         window=report.window if report else (),

@@ -1,0 +1,44 @@
+"""The stored pixels of keyframes."""
+
+from dataclasses import fields
+
+import numpy as np
+
+from ecslam.config import Config
+from ecslam.datasets import open_sequence
+from ecslam.keyframes import Keyframe, Shelf, make_keyframe
+from ecslam.pixels import Pixels
+
+
+def flat(count):
+    """So many white pixels a metre away."""
+    white = np.full((count, 3), 255, np.uint8)
+    return Pixels(np.zeros((count, 2), np.float32), np.ones(count, np.float32), white, np.zeros(count, bool))
+
+
+def test_a_shelf_keeps_keyframes_as_they_are_side_by_side():
+    room = open_sequence("synthetic/studio?size=160x120&frames=3")
+    made = [make_keyframe(room[i], room.intrinsics, Config(), np.random.default_rng(i)) for i in range(3)]
+    shelf = Shelf()
+    kept = [shelf.keep(keyframe) for keyframe in made]
+    for before, after in zip(made, kept, strict=True):
+        assert before.frame == after.frame
+        arrays = [(before.thumbnail, after.thumbnail)]
+        arrays += [(getattr(before.pixels, f.name), getattr(after.pixels, f.name)) for f in fields(Pixels)]
+        for old, new in arrays:
+            assert old.dtype == new.dtype
+            np.testing.assert_array_equal(old, new)
+            assert new.base is not None
+            assert new.ctypes.data % 4 == 0
+    ends = [k.thumbnail.ctypes.data + k.thumbnail.nbytes for k in kept[:-1]]
+    starts = [k.pixels.direction.ctypes.data for k in kept[1:]]
+    assert all(0 <= start - end < 64 for end, start in zip(ends, starts, strict=True))
+
+
+def test_a_shelf_takes_what_is_larger_than_its_blocks_and_what_is_empty():
+    shelf = Shelf()
+    for count in (0, 2 << 20, 3):
+        pixels = flat(count)
+        kept = shelf.keep(Keyframe(0, pixels, np.zeros(1200, np.float32)))
+        assert len(kept.pixels) == count
+        assert kept.pixels.depth.sum() == count
