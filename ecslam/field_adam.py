@@ -24,8 +24,8 @@ class FieldAdam:
         self.square = [torch.zeros_like(p) for p in self.parameters]
         self.count = torch.zeros((), device=self.parameters[0].device)
 
-    def step(self, gradients: Sequence[Tensor], rates: Sequence[float]) -> None:
-        """One update with a learning rate for each parameter."""
+    def step(self, gradients: Sequence[Tensor], rates: Sequence[float | Tensor]) -> None:
+        """One update with a learning rate for each parameter, a number or a tensor [] on the parameters' device."""
         self.count += 1
         for i, rate in enumerate(rates):
             torch._fused_adam_(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,17 +12,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config
+from .draws import DeviceDraw, Draw, device_draw, host_draw, padded
 from .field import TsdfField, grow_field, map_params, regrow
 from .field_adam import FieldAdam
-from .kernels import LOSS_NAMES, Backend, FieldParams
+from .kernels import LOSS_NAMES, Backend, FieldParams, RayBatch, Weights
+from .kernels.graphs import Recorder
 from .losses import smooth_lattice, smoothness
+from .pixel_bank import PixelBank
 from .pixels import Pixels
-from .pose_adam import PoseAdam
-from .rays import gather, kernel_weights, make_rays
-from .samples import resample_missing
+from .pose_adam import PoseAdam, pose_rates
+from .rays import DevicePixels, kernel_weights
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 
 MIN_BETA = 1.0
+CHUNK = 10  # iterations in a CUDA graph where no pose moves
 
 
 @dataclass(frozen=True)
@@ -39,15 +43,44 @@ def _tensors(params: FieldParams) -> list[Tensor]:
     return [params.table, params.w_in, params.w_sdf, params.w_rgb, params.beta]
 
 
-class Mapper:
-    """Owns the field and its Adam state; the only writer of both."""
+@dataclass(frozen=True)
+class Job:
+    """What all iterations of a run have in common. move: whether any pose does. smooth, settle: see ``Mapper.run``."""
 
-    def __init__(self, field: TsdfField, kernels: Backend, seed: int) -> None:
-        self.field, self.kernels = field, kernels
+    config: Config
+    move: bool
+    smooth: bool
+    settle: bool
+
+    @property
+    def weights(self) -> Weights:
+        """Loss weights."""
+        return kernel_weights(self.config.mapping.loss, self.config)
+
+    def pose_rates(self, fixed: NDArray[np.bool_]) -> Tensor:
+        """Learning rates [W, 6] of poses of which some are ``fixed`` [W]."""
+        m = self.config.mapping
+        return pose_rates(torch.from_numpy(fixed), m.lr_rotation, m.lr_translation)
+
+    def map_rates(self, left: float | Tensor) -> list[float | Tensor]:
+        """Learning rates of the map's parameters when the share ``left`` of the iterations remains."""
+        m, others = self.config.mapping, len(FieldParams.__dataclass_fields__) - 1
+        return [(left if self.settle else 1.0) * rate for rate in (m.lr_grid, *([m.lr_decoder] * others))]
+
+
+class Mapper:
+    """Owns the field and its Adam state; the only writer of both.
+
+    On a GPU the iterations are one CUDA graph, or a few, that never wait for the host.
+    """
+
+    def __init__(self, field: TsdfField, kernels: Backend, seed: int, recorder: Recorder | None = None) -> None:
+        self.field, self.kernels, self.recorder = field, kernels, recorder or Recorder()
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator().manual_seed(seed)
         self._gradients = map_params(field.params, torch.zeros_like)
         self._optimiser = FieldAdam(_tensors(field.params))
+        self._bank = PixelBank(field.device)
 
     def run(
         self,
@@ -65,39 +98,111 @@ class Mapper:
         Every iteration draws its rays from the stored pixels and transforms them by the current poses. smooth: with the
         smoothness term. settle: the map's learning rates fade to none, as those of the poses always do.
         """
-        m, field, device = config.mapping, self.field, self.field.device
-        poses = PoseAdam(torch.from_numpy(c2w).to(device), m.lr_rotation, m.lr_translation)
-        poses.fix(torch.from_numpy(np.flatnonzero(fixed)).to(device))
-        weights, move = kernel_weights(m.loss, config), not fixed.all()
-        first = last = torch.zeros(len(LOSS_NAMES), device=device)
         before = [t.clone() for t in self._learnt()]
-        for iteration in range(iterations):
-            if interrupt is not None:
-                interrupt()
-            pixels, row = gather(views, self._pick(views, m.rays, m.newest_share))
-            rays = make_rays(pixels, row, poses.c2w, field.layout.box, config, self._generator, device)
-            rays = resample_missing(rays, poses.c2w.float(), field, self.kernels, config.sampling, self._generator)
-            result = self.kernels.step(
-                field.layout, field.params, poses.c2w.float(), rays, weights, self._gradients, move
-            )
-            if smooth and m.smooth_weight > 0:
-                _, gradient = smoothness(field, smooth_lattice(field, m, self._generator))
-                self._gradients.table.add_(gradient, alpha=m.smooth_weight)
-            left = 1 - iteration / iterations
-            decoders = [m.lr_decoder] * (len(FieldParams.__dataclass_fields__) - 1)
-            rates = [(left if settle else 1.0) * rate for rate in (m.lr_grid, *decoders)]
-            self._optimiser.step(_tensors(self._gradients), rates)
-            field.params.beta.clamp_(min=MIN_BETA)
-            if result.d_c2w is not None:
-                poses.step(result.d_c2w, left)
-            last = result.losses
-            first = last if iteration == 0 else first
-        if not all(bool(torch.isfinite(t).all()) for t in (*self._learnt(), poses.c2w)):
+        job = Job(config, bool(not fixed.all()), smooth, settle)
+        run = self._on_host if self.field.device.type == "cpu" else self._on_device
+        moved, losses = run(job, views, c2w, fixed, iterations, interrupt or (lambda: None))
+        sound = torch.stack([torch.isfinite(t).all() for t in (*self._learnt(), moved)]).all()
+        told = torch.cat([moved.reshape(-1), losses[[0, -1]].reshape(-1).to(moved), sound[None].to(moved)]).cpu()
+        if not told[-1]:
             for tensor, kept in zip(self._learnt(), before, strict=True):
                 tensor.copy_(kept)
             return MapResult(c2w, {}, float("nan"), failed=True)
-        losses = dict(zip(LOSS_NAMES, last.tolist(), strict=True))
-        return MapResult(poses.c2w.cpu().numpy(), losses, float(first.sum()))
+        first, last = told[c2w.size : -1].float().view(2, -1)
+        poses = told[: c2w.size].view(c2w.shape).numpy()
+        return MapResult(poses, dict(zip(LOSS_NAMES, last.tolist(), strict=True)), float(first.sum()))
+
+    def _on_host(
+        self,
+        job: Job,
+        views: Sequence[Pixels],
+        c2w: NDArray[np.float64],
+        fixed: NDArray[np.bool_],
+        iterations: int,
+        interrupt: Callable[[], None],
+    ) -> tuple[Tensor, Tensor]:
+        """The poses [W, 4, 4] and the loss terms [I, 5] of all iterations (of none: zeros [1, 5])."""
+        draw = host_draw(views, job.config, self.field, self.kernels, self._rng, self._generator)
+        left = [1 - i / iterations for i in range(iterations)]
+        return self._iterate(job, draw, torch.from_numpy(c2w), job.pose_rates(fixed), left, interrupt)
+
+    def _on_device(
+        self,
+        job: Job,
+        views: Sequence[Pixels],
+        c2w: NDArray[np.float64],
+        fixed: NDArray[np.bool_],
+        iterations: int,
+        interrupt: Callable[[], None],
+    ) -> tuple[Tensor, Tensor]:
+        """The same, ``CHUNK`` iterations (with moving poses all) in a graph; ``interrupt`` is called between them."""
+        device, count = self.field.device, max(len(views), job.config.window.size)
+        generator = torch.Generator(device).manual_seed(int(self._rng.integers(2**62)))
+        still = np.arange(count) >= len(views)
+        still[: len(views)] |= fixed
+        poses, rates = torch.from_numpy(padded(c2w, count)).to(device), job.pose_rates(still).to(device)
+        left = (1 - torch.arange(iterations) / max(iterations, 1)).to(device)
+        losses = []
+        for part_left in left.split(max(iterations, 1) if job.move else CHUNK):
+            interrupt()
+            chosen = device_draw(self._bank, views, count, len(part_left), job.config, self.field.layout.box, generator)
+            inputs = (poses, rates, part_left, chosen.spans, chosen.row, chosen.box, chosen.jitter)
+            recorder = Recorder(plain=True) if job.smooth else self.recorder
+            poses, found = recorder(
+                partial(self._loop, job, chosen.pixels, chosen.missing),
+                *inputs,
+                key=(job, chosen.missing),
+                over=(self.field, self._optimiser, chosen.pixels),
+            )
+            losses.append(found)
+        return poses[: len(views)], torch.cat(losses)
+
+    def _loop(
+        self,
+        job: Job,
+        pixels: DevicePixels,
+        missing: bool,
+        c2w: Tensor,
+        rates: Tensor,
+        left: Tensor,
+        spans: Tensor,
+        row: Tensor,
+        box: Tensor,
+        jitter: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Iterations as a function of tensors. left: [I]; for what follows see ``DeviceDraw``."""
+        chosen = DeviceDraw(pixels, spans, row, box, jitter, missing)
+
+        def draw(iteration: int, poses: Tensor) -> RayBatch:
+            return chosen.rays(iteration, poses, job.config, self.field, self.kernels)
+
+        return self._iterate(job, draw, c2w, rates, left.unbind(), lambda: None)
+
+    def _iterate(
+        self,
+        job: Job,
+        draw: Draw,
+        c2w: Tensor,
+        rates: Tensor,
+        left: Sequence[float | Tensor],
+        interrupt: Callable[[], None],
+    ) -> tuple[Tensor, Tensor]:
+        """One iteration for each share in ``left`` of the learning rates: the poses and the loss terms [I, 5]."""
+        m, field = job.config.mapping, self.field
+        poses, losses = PoseAdam(c2w, rates), []
+        for iteration, share in enumerate(left):
+            interrupt()
+            rays, now = draw(iteration, poses.c2w), poses.c2w.float()
+            result = self.kernels.step(field.layout, field.params, now, rays, job.weights, self._gradients, job.move)
+            if job.smooth and m.smooth_weight > 0:
+                _, gradient = smoothness(field, smooth_lattice(field, m, self._generator))
+                self._gradients.table.add_(gradient, alpha=m.smooth_weight)
+            self._optimiser.step(_tensors(self._gradients), job.map_rates(share))
+            field.params.beta.clamp_(min=MIN_BETA)
+            if result.d_c2w is not None:
+                poses.step(result.d_c2w, share)
+            losses.append(result.losses)
+        return poses.c2w, torch.stack(losses or [torch.zeros(len(LOSS_NAMES), device=c2w.device)])
 
     def _learnt(self) -> list[Tensor]:
         adam = self._optimiser
@@ -116,9 +221,9 @@ class Mapper:
         }
 
     @classmethod
-    def restore(cls, state: Arrays, kernels: Backend, device: torch.device) -> Mapper:
+    def restore(cls, state: Arrays, kernels: Backend, device: torch.device, recorder: Recorder | None = None) -> Mapper:
         """The inverse of ``state``."""
-        self = cls(unpack_field(part("field", state), device), kernels, 0)
+        self = cls(unpack_field(part("field", state), device), kernels, 0, recorder)
         unpack_random(part("random", state), self._rng, self._generator)
         found = {k: torch.from_numpy(v.copy()).to(device) for k, v in part("adam", state).items()}
         adam = self._optimiser
@@ -126,13 +231,6 @@ class Mapper:
         adam.square = [found[f"square{i}"] for i in range(len(adam.parameters))]
         adam.count = found["count"]
         return self
-
-    def _pick(self, views: Sequence[Pixels], rays: int, newest_share: float) -> list[NDArray[np.int64]]:
-        """The newest view gets ``newest_share`` of the rays (an equal share if that is more), the others the rest."""
-        newest = max(round(rays * newest_share), -(-rays // len(views)))
-        older = -(-(rays - newest) // max(len(views) - 1, 1))
-        counts = [older] * (len(views) - 1) + [newest]
-        return [self._rng.integers(0, len(view), count) for view, count in zip(views, counts, strict=True)]
 
     def grow(self, box: NDArray[np.float64]) -> None:
         """Extend the field to the union of its box and ``box`` [2, 3]; values inside and the Adam state are kept."""

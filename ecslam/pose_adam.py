@@ -10,27 +10,26 @@ from . import se3
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 
 
-class PoseAdam:
-    """Optimises poses c2w [P, 4, 4] (float64) from gradients with respect to their upper rows."""
+def pose_rates(fixed: Tensor, lr_rotation: float, lr_translation: float) -> Tensor:
+    """Learning rates [P, 6] (float64) for poses of which the ``fixed`` [P] never move."""
+    rates = torch.tensor([lr_translation] * 3 + [lr_rotation] * 3, dtype=torch.float64)
+    return torch.where(fixed[:, None], 0.0, rates)
 
-    def __init__(self, c2w: Tensor, lr_rotation: float, lr_translation: float) -> None:
-        self.c2w = c2w
-        lr = torch.tensor([lr_translation] * 3 + [lr_rotation] * 3, dtype=c2w.dtype)
-        self._lr = lr.to(c2w.device).expand(len(c2w), 6).clone()
-        self._mean = torch.zeros(len(c2w), 6, dtype=c2w.dtype, device=c2w.device)
-        self._square = torch.zeros_like(self._mean)
+
+class PoseAdam:
+    """Optimises poses c2w [P, 4, 4] (float64) from gradients with respect to their upper rows. rates: [P, 6]."""
+
+    def __init__(self, c2w: Tensor, rates: Tensor) -> None:
+        self.c2w, self._rates = c2w, rates
+        self._mean, self._square = torch.zeros_like(rates), torch.zeros_like(rates)
         self._count = 0
 
-    def fix(self, rows: Tensor) -> None:
-        """Never move the poses at ``rows``."""
-        self._lr[rows] = 0.0
-
-    def step(self, d_c2w: Tensor, share: float = 1.0) -> None:
-        """One update from gradients [P, 3, 4] at ``share`` of the learning rate."""
+    def step(self, d_c2w: Tensor, share: float | Tensor = 1.0) -> None:
+        """One update from gradients [P, 3, 4] at ``share`` of the learning rates."""
         gradient = se3.tangent_gradient(self.c2w, d_c2w.to(self.c2w.dtype))
         self._count += 1
         self._mean.mul_(BETA1).add_(gradient, alpha=1 - BETA1)
         self._square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
         mean = self._mean / (1 - BETA1**self._count)
         square = self._square / (1 - BETA2**self._count)
-        self.c2w = se3.retract(self.c2w, -share * self._lr * mean / (square.sqrt() + EPSILON))
+        self.c2w = se3.retract(self.c2w, -share * self._rates * mean / (square.sqrt() + EPSILON))

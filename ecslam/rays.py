@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -13,6 +14,31 @@ from .config import Config, LossWeights
 from .kernels import RayBatch, Weights
 from .pixels import Pixels
 from .samples import ray_exit, sample_depths
+
+
+@dataclass(frozen=True)
+class DevicePixels:
+    """``Pixels`` as tensors on one device. direction: float32 [N, 3], z = 1. depth: float32 [N]. color: uint8 [N, 3].
+    feature: bool [N]."""
+
+    direction: Tensor
+    depth: Tensor
+    color: Tensor
+    feature: Tensor
+
+    def take(self, index: Tensor) -> DevicePixels:
+        """The pixels at ``index``."""
+        return DevicePixels(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+def upload(pixels: Pixels, device: torch.device) -> DevicePixels:
+    """The same pixels on ``device``."""
+    return DevicePixels(
+        torch.nn.functional.pad(torch.from_numpy(pixels.direction), (0, 1), value=1.0).to(device),
+        torch.from_numpy(pixels.depth).to(device),
+        torch.from_numpy(pixels.color).to(device),
+        torch.from_numpy(pixels.feature).to(device),
+    )
 
 
 def gather(views: Sequence[Pixels], picks: Sequence[NDArray[np.int64]]) -> tuple[Pixels, NDArray[np.int64]]:
@@ -28,30 +54,24 @@ def gather(views: Sequence[Pixels], picks: Sequence[NDArray[np.int64]]) -> tuple
 
 
 def make_rays(
-    pixels: Pixels,
-    pose: NDArray[np.int64],
-    c2w: Tensor,
-    box: Tensor,
-    config: Config,
-    generator: torch.Generator,
-    device: torch.device,
+    pixels: DevicePixels, row: Tensor, c2w: Tensor, box: Tensor, config: Config, jitter: Tensor, missing: bool
 ) -> RayBatch:
-    """Rays of ``pixels`` with their sample depths. pose [R] says which row of c2w [P, 4, 4] each ray belongs to."""
-    direction = torch.nn.functional.pad(torch.from_numpy(pixels.direction), (0, 1), value=1.0).to(device)
-    depth = torch.from_numpy(pixels.depth).to(device)
-    row = torch.from_numpy(pose).to(device)
-    far = torch.full_like(depth, config.depth_far_m)
-    missing = depth <= 0
-    if missing.any():
-        poses = c2w.to(direction)[row[missing]]
-        world = torch.einsum("rij,rj->ri", poses[:, :3, :3], direction[missing])
-        far[missing] = ray_exit(poses[:, :3, 3], world, box.to(direction), config.depth_far_m)
+    """Rays of ``pixels`` with their sample depths, never waiting for the device.
+
+    row: [R] says which of the poses c2w [P, 4, 4] each ray belongs to. box: [2, 3] metres. jitter: [R, S] in 0..1.
+    missing: whether some have no depth, and so end where they leave the box.
+    """
+    far = torch.full_like(pixels.depth, config.depth_far_m)
+    if missing:
+        poses = c2w.to(far)[row]
+        world = (poses[:, :3, :3] @ pixels.direction[:, :, None])[:, :, 0]
+        far = ray_exit(poses[:, :3, 3], world, box, config.depth_far_m)
     return RayBatch(
-        direction=direction,
-        z=sample_depths(depth, far, config.sampling, generator),
-        depth=depth,
-        color=torch.from_numpy(pixels.color).to(device).float() / 255,
-        feature=torch.from_numpy(pixels.feature).to(device),
+        direction=pixels.direction,
+        z=sample_depths(pixels.depth, far, config.sampling, jitter),
+        depth=pixels.depth,
+        color=pixels.color.float() / 255,
+        feature=pixels.feature,
         pose=row,
     )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,6 +11,8 @@ from torch import Tensor
 from .config import SamplingConfig
 from .field import TsdfField
 from .kernels import Backend, RayBatch
+
+LEAST_UNIFORM = 4  # fewer samples say too little about where the surface is
 
 
 def ray_exit(origin: Tensor, direction: Tensor, box: Tensor, limit: float) -> Tensor:
@@ -24,14 +28,14 @@ def stratified(near: Tensor, far: Tensor, count: int, jitter: Tensor) -> Tensor:
     return near[:, None] + (far - near)[:, None] * share
 
 
-def sample_depths(depth: Tensor, far: Tensor, config: SamplingConfig, generator: torch.Generator) -> Tensor:
+def sample_depths(depth: Tensor, far: Tensor, config: SamplingConfig, jitter: Tensor) -> Tensor:
     """Sorted depths [R, uniform + near_depth] (paper, section III-A: N = N_u + N_d).
 
     With a measured depth d, N_u samples run from the camera to d + d_t and N_d lie within [d - d_t, d + d_t]. Rays
-    without one (depth 0) get all their samples uniformly out to ``far`` [R]; see ``importance_depths``.
+    without one (depth 0) get all their samples uniformly out to ``far`` [R]; see ``importance_depths``. jitter:
+    [R, uniform + near_depth] in 0..1.
     """
     n_u, n_d, reach = config.uniform, config.near_depth, config.depth_range_m
-    jitter = torch.rand(len(depth), n_u + n_d, generator=generator, device=generator.device).to(depth.device)
     has = depth > 0
     near = torch.full_like(depth, config.near_m)
     end = torch.where(has, depth + reach, far)
@@ -46,39 +50,44 @@ def ascending(z: Tensor) -> Tensor:
     return torch.from_numpy(np.sort(z.numpy(), axis=1)) if z.device.type == "cpu" else z.sort(1).values
 
 
-def importance_depths(z: Tensor, weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """``count`` depths per ray [R, count] drawn from rendered weights [R, S] at depths z [R, S] (inverse transform)."""
+def importance_depths(z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
+    """Depths [R, K] drawn from rendered weights [R, S] at depths z [R, S] (inverse transform). jitter: [R, K], 0..1."""
     middle = 0.5 * (z[:, 1:] + z[:, :-1])
     density = weights[:, 1:-1] + 1e-5
     cdf = torch.cumsum(density / density.sum(1, keepdim=True), 1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], 1)
-    u = stratified(
-        torch.zeros_like(z[:, 0]),
-        torch.ones_like(z[:, 0]),
-        count,
-        torch.rand(len(z), count, generator=generator, device=generator.device).to(z.device),
-    )
+    u = stratified(torch.zeros_like(z[:, 0]), torch.ones_like(z[:, 0]), jitter.shape[1], jitter)
     right = torch.searchsorted(cdf, u, right=True).clamp(1, cdf.shape[1] - 1)
     c0, c1 = cdf.gather(1, right - 1), cdf.gather(1, right)
     z0, z1 = middle.gather(1, right - 1), middle.gather(1, right)
     return z0 + (u - c0) / (c1 - c0).clamp_min(1e-8) * (z1 - z0)
 
 
+def rendered_depths(
+    rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, config: SamplingConfig, jitter: Tensor
+) -> Tensor:
+    """Depths [R, S] of rays without a measured one: ``uniform`` of their own samples, the rest where the map has its
+    surface. jitter: [R, S - uniform] in 0..1."""
+    keep = (torch.arange(config.uniform, device=rays.z.device) * (rays.z.shape[1] / config.uniform)).long()
+    z = rays.z[:, keep].contiguous()
+    _, _, weights = kernels.render(field.layout, field.params, c2w, replace(rays, z=z))
+    return ascending(torch.cat([z, importance_depths(z, weights, jitter)], 1))
+
+
 def resample_missing(
     rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, config: SamplingConfig, generator: torch.Generator
 ) -> RayBatch:
-    """Rays without depth keep ``uniform`` of their samples and get ``near_depth`` where the map has its surface."""
+    """Rays without depth get ``rendered_depths``. Waits for the device."""
     missing = torch.nonzero(rays.depth <= 0)[:, 0]
-    if len(missing) == 0 or config.uniform < 4:
+    if len(missing) == 0 or config.uniform < LEAST_UNIFORM:
         return rays
-    stride = rays.z.shape[1] / config.uniform
-    keep = (torch.arange(config.uniform, device=rays.z.device) * stride).long()
-    z = rays.z[missing][:, keep].contiguous()
-    few = RayBatch(
-        rays.direction[missing], z, rays.depth[missing], rays.color[missing], rays.feature[missing], rays.pose[missing]
-    )
-    _, _, weights = kernels.render(field.layout, field.params, c2w, few)
-    added = importance_depths(z, weights, rays.z.shape[1] - config.uniform, generator)
+    few = RayBatch(*(getattr(rays, f.name)[missing] for f in fields(RayBatch)))
+    jitter = uniform(generator, rays.z.device, len(missing), rays.z.shape[1] - config.uniform)
     depths = rays.z.clone()
-    depths[missing] = ascending(torch.cat([z, added], 1))
-    return RayBatch(rays.direction, depths, rays.depth, rays.color, rays.feature, rays.pose)
+    depths[missing] = rendered_depths(few, c2w, field, kernels, config, jitter)
+    return replace(rays, z=depths)
+
+
+def uniform(generator: torch.Generator, device: torch.device, *shape: int) -> Tensor:
+    """Random numbers in 0..1 on ``device``, drawn where the generator is."""
+    return torch.rand(*shape, generator=generator, device=generator.device).to(device)

@@ -20,6 +20,7 @@ from .align import LearnedSurface, Surface, align, cost_at, known_points
 from .config import Config
 from .field import TsdfField, box_of_points, create_field
 from .indices import evenly
+from .kernels.graphs import Recorder
 from .keyframes import Keyframe, Shelf, make_keyframe, make_thumbnail, most_similar
 from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
@@ -64,6 +65,7 @@ class Slam:
         self.config, self.intrinsics = config, intrinsics
         self.device = device or torch.device("cpu")
         self.kernels_name, self._kernels, self.kernels_note = seam.select(self.device)
+        self._recorder = self._new_recorder()
         self.trajectory = Trajectory()
         self.keyframes: list[Keyframe] = []
         self._shelf = Shelf()
@@ -81,7 +83,7 @@ class Slam:
         self._pending: Future[MapResult] | None = None
         self._window: NDArray[np.int64] = np.empty(0, np.int64)
         self._frozen: TsdfField | None = None
-        self._note, self._outside = "", 0.0
+        self._note, self._outside, self._graphs_failed = "", 0.0, False
 
     # ---- one frame --------------------------------------------------------------------------------------------------
 
@@ -128,7 +130,7 @@ class Slam:
         if box is None:
             box = box_of_points(_world(keyframe.pixels, self._first_pose), self.config.field.box_margin_m)
         field = create_field(self.config.field, box, self.config.seed, self.device)
-        self.mapper = Mapper(field, self._kernels, self.config.seed)
+        self.mapper = Mapper(field, self._kernels, self.config.seed, self._new_recorder())
         self._frozen = field
         self.trajectory.append(self._first_pose, frame.timestamp, True, keyframe=True)
         self.keyframes.append(self._shelf.keep(keyframe))
@@ -204,7 +206,9 @@ class Slam:
         if config.tracking.iterations > 0:
             pixels = choose_pixels(frame, self.intrinsics, config.tracking.rays, config, self._rng)
             pixels = self._known(pixels, c2w)
-            rendered, losses = track_adam(self._require_field(), self._kernels, pixels, c2w, config, self._generator)
+            rendered, losses = track_adam(
+                self._require_field(), self._kernels, pixels, c2w, config, self._generator, self._recorder
+            )
             agreed = WORSE * cost_at(surface, points, c2w, config)
             if config.align.to == "none" or cost_at(surface, points, rendered, config) <= agreed:
                 c2w = rendered
@@ -218,10 +222,13 @@ class Slam:
 
     def _known(self, pixels: Pixels, guess: NDArray[np.float64]) -> Pixels:
         """The pixels whose measured point, seen from ``guess``, lies where the map has been observed; all of them when
-        that leaves too few."""
+        that leaves too few. On a GPU some of them twice, so that a recorded loop always finds the same number."""
         local = np.concatenate([pixels.direction, np.ones((len(pixels), 1), np.float32)], 1) * pixels.depth[:, None]
         known = self._observed.contains(local @ guess[:3, :3].T + guess[:3, 3]) & (pixels.depth > 0)
-        return pixels.take(np.flatnonzero(known)) if known.sum() >= 100 else pixels
+        index = np.flatnonzero(known)
+        if self.device.type != "cpu":
+            index = np.resize(index, len(pixels))
+        return pixels.take(index) if known.sum() >= 100 else pixels
 
     def _fuse(self, frame: Frame) -> None:
         if self._volume is not None:
@@ -275,7 +282,13 @@ class Slam:
 
     def _take_note(self) -> str:
         note, self._note = self._note, ""
+        for recorder in (self._recorder, self.mapper.recorder if self.mapper else self._recorder):
+            if recorder.failure and not self._graphs_failed:
+                self._graphs_failed, note = True, note or recorder.failure
         return note
+
+    def _new_recorder(self) -> Recorder:
+        return Recorder(plain=self.kernels_name != "gpu")
 
     def _apply(self, result: MapResult) -> None:
         if result.failed:
@@ -293,7 +306,7 @@ class Slam:
 
     def _tracking_field(self) -> TsdfField:
         assert self.mapper is not None
-        return self.mapper.field if self._pool is None else self.mapper.field.freeze()
+        return self.mapper.field if self._pool is None else self.mapper.field.freeze(self._frozen)
 
     # ---- keyframes, box, views --------------------------------------------------------------------------------------
 
@@ -369,7 +382,7 @@ class Slam:
         self = cls(config, intrinsics, device=device, bounds=bounds)
         self.trajectory = Trajectory.restore(part("trajectory", state))
         self.keyframes = unpack_keyframes(part("keyframes", state))
-        self.mapper = Mapper.restore(part("mapper", state), self._kernels, self.device)
+        self.mapper = Mapper.restore(part("mapper", state), self._kernels, self.device, self._new_recorder())
         self._frozen = self._tracking_field()
         unpack_random(part("random", state), self._rng, self._generator)
         self._observed.keys = np.array(state["observed"], np.int64)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from .align import Surface, align, known_points, transform
 from .config import Config
 from .field import TsdfField
-from .kernels import LOSS_NAMES, Backend
+from .kernels import LOSS_NAMES, Backend, RayBatch, Weights
+from .kernels.graphs import Recorder
 from .pixels import Pixels
-from .pose_adam import PoseAdam
-from .rays import kernel_weights, make_rays
-from .samples import resample_missing
+from .pose_adam import PoseAdam, pose_rates
+from .rays import kernel_weights, make_rays, upload
+from .samples import resample_missing, uniform
 
 LEAST_SEEN = 0.1
 
@@ -37,26 +40,40 @@ def track_adam(
     guess: NDArray[np.float64],
     config: Config,
     generator: torch.Generator,
+    recorder: Recorder,
 ) -> tuple[NDArray[np.float64], dict[str, float]]:
     """The paper's tracking: Adam on the rendered losses from ``guess`` [4, 4]; pixels are sampled once and only
     transformed in each iteration. Returns the iterate [4, 4] with the least loss and the weighted terms there."""
-    t, device = config.tracking, field.device
-    optimiser = PoseAdam(torch.from_numpy(guess)[None].to(device), t.lr_rotation, t.lr_translation)
-    pose = np.zeros(len(pixels), np.int64)
-    rays = make_rays(pixels, pose, optimiser.c2w, field.layout.box, config, generator, device)
-    rays = resample_missing(rays, optimiser.c2w.float(), field, kernels, config.sampling, generator)
+    t, s, device = config.tracking, config.sampling, field.device
+    c2w = torch.from_numpy(guess)[None].to(device)
+    row, missing = torch.zeros(len(pixels), dtype=torch.int64, device=device), bool((pixels.depth <= 0).any())
+    jitter = uniform(generator, device, len(pixels), s.uniform + s.near_depth)
+    rays = make_rays(upload(pixels, device), row, c2w, field.layout.box.to(device), config, jitter, missing)
+    if missing:
+        rays = resample_missing(rays, c2w.float(), field, kernels, s, generator)
+    rates = pose_rates(torch.zeros(1, dtype=torch.bool), t.lr_rotation, t.lr_translation).to(device)
     weights = kernel_weights(t.loss, config)
-    best = optimiser.c2w
-    best_terms = torch.full((len(LOSS_NAMES),), torch.inf, device=device)
-    for _ in range(t.iterations):
-        result = kernels.step(field.layout, field.params, optimiser.c2w.float(), rays, weights, None, True)
+    loop = partial(_descend, field, kernels, weights, t.iterations)
+    tensors = (getattr(rays, f.name) for f in fields(RayBatch))
+    best, terms = recorder(loop, c2w, rates, *tensors, key=(weights, t.iterations), over=(field,))
+    return best[0].cpu().numpy(), dict(zip(LOSS_NAMES, terms.tolist(), strict=True))
+
+
+def _descend(
+    field: TsdfField, kernels: Backend, weights: Weights, iterations: int, c2w: Tensor, rates: Tensor, *rays: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The iterations, never waiting for the device: the best iterate [1, 4, 4] and the terms [5] there."""
+    optimiser, best = PoseAdam(c2w, rates), c2w
+    best_terms = torch.full((len(LOSS_NAMES),), torch.inf, device=c2w.device)
+    for _ in range(iterations):
+        pose = optimiser.c2w.float()
+        result = kernels.step(field.layout, field.params, pose, RayBatch(*rays), weights, None, True)
         better = result.losses.sum() < best_terms.sum()
         best = torch.where(better, optimiser.c2w, best)
         best_terms = torch.where(better, result.losses, best_terms)
         assert result.d_c2w is not None
         optimiser.step(result.d_c2w)
-    c2w = best[0].cpu().numpy()
-    return c2w, dict(zip(LOSS_NAMES, best_terms.tolist(), strict=True))
+    return best, best_terms
 
 
 def fit(surface: Surface, pixels: Pixels, c2w: NDArray[np.float64], truncation_m: float) -> float:

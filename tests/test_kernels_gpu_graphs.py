@@ -2,26 +2,9 @@
 
 import pytest
 import torch
+from fake_graphs import FakeGraphs
 
 from ecslam.kernels.graphs import Recorder
-
-
-class FakeGraphs:
-    """Stands in for CUDA: recording runs nothing, replaying writes the results into the recorded outputs."""
-
-    def __init__(self):
-        self.recorded = self.replayed = 0
-
-    def capture(self, function, device):
-        self.recorded += 1
-        outputs = tuple(torch.full((2,), torch.nan) for _ in range(2))
-
-        def replay():
-            self.replayed += 1
-            for mine, found in zip(outputs, function(), strict=True):
-                mine.copy_(found)
-
-        return replay, outputs
 
 
 def sum_and_difference(a, b):

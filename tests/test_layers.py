@@ -22,7 +22,7 @@ LAYERS = (
     ("kernels",),
     ("field",),
     ("pixels", "samples", "rays", "rendering", "losses", "datasets", "observed", "volume"),
-    ("keyframes", "window", "trajectory", "pose_adam", "field_adam", "views", "saving"),
+    ("keyframes", "window", "trajectory", "pixel_bank", "draws", "pose_adam", "field_adam", "views", "saving"),
     ("align", "tracker", "mapper", "loops", "recovery", "meshing", "meshing_blocks", "meshing_table", "evaluation"),
     ("slam",),
     ("runtime",),

@@ -197,7 +197,7 @@ def _batch(
     world = torch.einsum("rij,rj->ri", c2w[pose, :3, :3], direction)
     low, high = torch.from_numpy(ROOM).float() * 0.9
     depth = torch.maximum((low - c2w[pose, :3, 3]) / world, (high - c2w[pose, :3, 3]) / world).amin(1)
-    z = sample_depths(depth, depth, config.sampling, generator)
+    z = sample_depths(depth, depth, config.sampling, torch.rand(count, _samples(config), generator=generator))
     color, feature = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) < 0.2
     parts = (t.to(device) for t in (direction, z, depth, color, feature, pose))
     return c2w.to(device), RayBatch(*parts)

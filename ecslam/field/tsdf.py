@@ -31,9 +31,14 @@ class TsdfField:
         """How many learnt numbers there are."""
         return sum(getattr(self.params, f.name).numel() for f in fields(self.params))
 
-    def freeze(self) -> TsdfField:
-        """A copy that later mapping does not touch (about a millisecond)."""
-        return TsdfField(self.layout, map_params(self.params, torch.clone))
+    def freeze(self, into: TsdfField | None = None) -> TsdfField:
+        """A copy that later mapping does not touch (about a millisecond): ``into``, where that has the same layout and
+        is another field, so that what has been recorded over it stays valid."""
+        if into is None or into is self or into.layout is not self.layout:
+            return TsdfField(self.layout, map_params(self.params, torch.clone))
+        for f in fields(self.params):
+            getattr(into.params, f.name).copy_(getattr(self.params, f.name))
+        return into
 
 
 def map_params(params: FieldParams, function: object) -> FieldParams:

@@ -43,14 +43,14 @@ class Recorder:
     """Calls functions, and from the second call of one with the same sizes on replays it as a CUDA graph.
 
     The first call runs plainly, which also compiles kernels and fills caches, so nothing runs that was not asked for
-    and a function may change what it holds in place. Without CUDA, or once recording has failed, every call is plain;
-    ``failure`` then says why. Results are copies. ``keep`` graphs are kept, the least recently used go first. One
-    thread may use it at a time.
+    and a function may change what it holds in place. If it is to be ``plain``, without CUDA, and once recording has
+    failed, every call is plain; ``failure`` then says why. Results are copies. ``keep`` graphs are kept, the least
+    recently used go first. One thread may use it at a time.
     """
 
-    def __init__(self, keep: int = 4, capture: Capture | None = None) -> None:
+    def __init__(self, keep: int = 4, capture: Capture | None = None, plain: bool = False) -> None:
         self.failure = ""
-        self._keep, self._capture = keep, capture
+        self._keep, self._capture, self._plain = keep, capture, plain
         self._held: dict[Hashable, _Held] = {}
 
     def __call__(
@@ -62,7 +62,7 @@ class Recorder:
         objects with tensors that it reads or changes without being given them; another object means another graph.
         """
         device = inputs[0].device
-        if self.failure or not (self._capture or device.type == "cuda"):
+        if self._plain or self.failure or not (self._capture or device.type == "cuda"):
             return function(*inputs)
         sizes = tuple((t.shape, t.dtype, t.device) for t in inputs)
         whole = (key, sizes, tuple(id(held) for held in over))

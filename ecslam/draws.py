@@ -1,0 +1,116 @@
+"""The rays of a mapping iteration: drawn by numpy on the CPU, or from pixels and random numbers that lie on a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .config import Config
+from .field import TsdfField
+from .indices import evenly
+from .kernels import Backend, RayBatch
+from .pixel_bank import PixelBank
+from .pixels import Pixels
+from .rays import DevicePixels, gather, make_rays, upload
+from .samples import LEAST_UNIFORM, rendered_depths, resample_missing, uniform
+
+Draw = Callable[[int, Tensor], RayBatch]
+
+
+def shares(views: int, rays: int, newest_share: float) -> list[int]:
+    """How many rays each view gets: the newest ``newest_share`` of them (an equal share if that is more), the others
+    the rest, rounded up."""
+    newest = max(round(rays * newest_share), -(-rays // views))
+    older = -(-(rays - newest) // max(views - 1, 1))
+    return [older] * (views - 1) + [newest]
+
+
+def host_draw(
+    views: Sequence[Pixels],
+    config: Config,
+    field: TsdfField,
+    kernels: Backend,
+    rng: np.random.Generator,
+    generator: torch.Generator,
+) -> Draw:
+    """Rays for (iteration, poses [W, 4, 4]), on the CPU."""
+    m, s = config.mapping, config.sampling
+    counts = shares(len(views), m.rays, m.newest_share)
+
+    def draw(iteration: int, c2w: Tensor) -> RayBatch:
+        picks = [rng.integers(0, len(view), count) for view, count in zip(views, counts, strict=True)]
+        pixels, row = gather(views, picks)
+        missing = bool((pixels.depth <= 0).any())
+        jitter = uniform(generator, c2w.device, len(pixels), s.uniform + s.near_depth)
+        chosen = upload(pixels, c2w.device)
+        rays = make_rays(chosen, torch.from_numpy(row), c2w, field.layout.box, config, jitter, missing)
+        return resample_missing(rays, c2w.float(), field, kernels, s, generator) if missing else rays
+
+    return draw
+
+
+@dataclass(frozen=True)
+class DeviceDraw:
+    """What the rays of a loop are drawn from, on one device.
+
+    spans: int64 [W, 2], first row and count of each view in ``pixels``. row: int64 [R], the view of each ray. box: [2,
+    3] metres. missing: whether some pixels have no depth. jitter: [I, R, 1 + S], which pixel and where its samples lie;
+    with ``missing`` [I, R, 1 + S + near_depth], where those lie that follow the rendered depth.
+    """
+
+    pixels: DevicePixels
+    spans: Tensor
+    row: Tensor
+    box: Tensor
+    jitter: Tensor
+    missing: bool
+
+    def rays(self, iteration: int, c2w: Tensor, config: Config, field: TsdfField, kernels: Backend) -> RayBatch:
+        """The rays of an iteration with poses c2w [W, 4, 4], never waiting for the device."""
+        s, jitter = config.sampling, self.jitter[iteration]
+        count = s.uniform + s.near_depth
+        first, length = self.spans[self.row].unbind(1)
+        at = first + torch.minimum((jitter[:, 0] * length).long(), length - 1)
+        pixels = self.pixels.take(at)
+        rays = make_rays(pixels, self.row, c2w, self.box, config, jitter[:, 1 : 1 + count], self.missing)
+        if not self.missing or s.uniform < LEAST_UNIFORM:
+            return rays
+        z = rendered_depths(rays, c2w.float(), field, kernels, s, jitter[:, 1 + count :])
+        return replace(rays, z=torch.where(rays.depth[:, None] > 0, rays.z, z))
+
+
+def device_draw(
+    bank: PixelBank,
+    views: Sequence[Pixels],
+    poses: int,
+    iterations: int,
+    config: Config,
+    box: Tensor,
+    generator: torch.Generator,
+) -> DeviceDraw:
+    """Everything random of so many iterations at once. Sizes are always the same, so that a graph can be replayed:
+    exactly ``rays`` rays, and room for so many ``poses``."""
+    m, s, device = config.mapping, config.sampling, generator.device
+    spans = np.zeros((poses, 2), np.int64)
+    spans[: len(views)] = bank.spans(views)
+    row = np.repeat(np.arange(len(views)), shares(len(views), m.rays, m.newest_share))
+    missing = any(bool((view.depth <= 0).any()) for view in views)
+    numbers = 1 + s.uniform + (2 if missing else 1) * s.near_depth
+    return DeviceDraw(
+        bank.columns,
+        torch.from_numpy(spans).to(device),
+        torch.from_numpy(row[evenly(len(row), m.rays)]).to(device),
+        box.to(device),
+        uniform(generator, device, iterations, m.rays, numbers),
+        missing,
+    )
+
+
+def padded(c2w: NDArray[np.float64], poses: int) -> NDArray[np.float64]:
+    """The poses [W, 4, 4] with identities behind them: [poses, 4, 4]."""
+    return np.concatenate([c2w, np.tile(np.eye(4), (poses - len(c2w), 1, 1))])
