@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config
-from .types import Frame, Intrinsics
+from .types import Corners, Frame, Intrinsics
 
 
 @dataclass(frozen=True)
@@ -55,19 +55,30 @@ class Points:
         return Points(self.local[::stride].contiguous(), self.light[::stride].contiguous())
 
 
-def feature_points(color: NDArray[np.uint8], config: Config, limit: int) -> NDArray[np.int64]:
-    """Flat indices of at most ``limit`` Shi-Tomasi corners of an RGB image [H, W, 3], strongest first."""
+def find_corners(color: NDArray[np.uint8], config: Config) -> Corners:
+    """The ``feature_count`` strongest Shi-Tomasi corners of an RGB image [H, W, 3]."""
     height, width = color.shape[:2]
-    border = _border(config, height, width)
-    count = min(limit, config.feature_count)
-    if count <= 0:
-        return np.empty(0, np.int64)
+    border, none = _border(config, height, width), np.empty(0, np.int64)
+    if config.feature_count <= 0:
+        return Corners(none, _corner_settings(config))
     gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[border : height - border, border : width - border]
-    corners = cv2.goodFeaturesToTrack(gray, count, config.feature_quality, config.feature_distance_px)
-    if corners is None:
-        return np.empty(0, np.int64)
-    u, v = np.rint(corners.reshape(-1, 2)).astype(np.int64).T + border
-    return v * width + u
+    found = cv2.goodFeaturesToTrack(gray, config.feature_count, config.feature_quality, config.feature_distance_px)
+    if found is None:
+        return Corners(none, _corner_settings(config))
+    u, v = np.rint(found.reshape(-1, 2)).astype(np.int64).T + border
+    return Corners(v * width + u, _corner_settings(config))
+
+
+def feature_points(frame: Frame, config: Config, limit: int) -> NDArray[np.int64]:
+    """Flat indices of a frame's strongest corners, ``limit`` at most; those that were found ahead, if there are any."""
+    corners = frame.corners
+    if corners is None or corners.settings != _corner_settings(config):
+        corners = find_corners(frame.color, config)
+    return corners.index[:limit]
+
+
+def _corner_settings(config: Config) -> tuple[float, ...]:
+    return config.feature_count, config.feature_quality, config.feature_distance_px, config.border_px
 
 
 def grid_points(height: int, width: int, border: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -94,7 +105,7 @@ def choose_pixels(
     height, width = frame.depth.shape
     border = 0 if rim else _border(config, height, width)
     if config.fus:
-        corners = feature_points(frame.color, config, count // 2)
+        corners = feature_points(frame, config, count // 2)
         rest = grid_points(height, width, border, count - len(corners), rng)
         index = np.concatenate([corners, rest])
         feature = np.arange(len(index)) < len(corners)

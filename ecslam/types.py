@@ -58,12 +58,20 @@ class Intrinsics:
 
 
 @dataclass(frozen=True)
+class Corners:
+    """Corners of an image. index: int64 [K], flat pixel indices, strongest first. settings: by what they were found."""
+
+    index: NDArray[np.int64]
+    settings: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Frame:
     """One RGB-D image.
 
     index: position in the sequence. timestamp: seconds. color: uint8 [H, W, 3], RGB. depth: float32 [H, W], metres
     along the optical axis, exactly 0 where there is none (never NaN or Inf). c2w_gt: float64 [4, 4] camera-to-world
-    ground truth in metres, or None.
+    ground truth in metres, or None. corners: of ``color``, where somebody has looked for them already.
     """
 
     index: int
@@ -71,6 +79,7 @@ class Frame:
     color: NDArray[np.uint8]
     depth: NDArray[np.float32]
     c2w_gt: NDArray[np.float64] | None = None
+    corners: Corners | None = None
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ def test_grid_gives_exactly_the_count_spread_evenly(count, border, seed):
 def test_features_are_corners_and_come_first(frame):
     config = Config()
     pixels = choose_pixels(frame, CAMERA, 1000, config, np.random.default_rng(0))
-    corners = feature_points(frame.color, config, 500)
+    corners = feature_points(frame, config, 500)
     assert len(pixels) == 1000
     assert pixels.feature.sum() == len(corners) > 100
     assert pixels.feature[: len(corners)].all()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 
@@ -17,7 +17,8 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
     """Yields (index, frame) in the order of ``indices`` (default: all), with at most ``ahead`` frames read in advance.
     Reading begins at once.
 
-    workers: threads, by default one a core within reason; ahead: by default two a worker.
+    workers: threads, by default one a core within reason; ahead: by default two a worker. prepare: what the same
+    threads make of each frame.
     Whatever goes wrong with one frame is yielded in its place as a FrameError and the rest goes on. ``close``, or
     dropping the iterator, cancels what has not begun and waits only for the reads under way.
     """
@@ -29,10 +30,11 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
         *,
         workers: int | None = None,
         ahead: int | None = None,
+        prepare: Callable[[Frame], Frame] = lambda frame: frame,
     ) -> None:
         workers = workers or min(max(os.cpu_count() or 1, 2), MOST_WORKERS)
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="prefetch")
-        self._sequence = sequence
+        self._sequence, self._prepare = sequence, prepare
         self._coming = iter(range(len(sequence)) if indices is None else indices)
         self._pending: deque[tuple[int, Future[Frame | FrameError]]] = deque()
         self._submit(2 * workers if ahead is None else ahead)
@@ -56,12 +58,12 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
 
     def _submit(self, count: int) -> None:
         for index in islice(self._coming, count):
-            self._pending.append((index, self._pool.submit(_read, self._sequence, index)))
+            self._pending.append((index, self._pool.submit(_read, self._sequence, self._prepare, index)))
 
 
-def _read(sequence: Sequence, index: int) -> Frame | FrameError:
+def _read(sequence: Sequence, prepare: Callable[[Frame], Frame], index: int) -> Frame | FrameError:
     try:
-        return sequence[index]
+        return prepare(sequence[index])
     except FrameError as error:
         return error
     except Exception as error:

@@ -20,6 +20,7 @@ from .. import datasets
 from ..config import Config
 from ..messages import Command, Event, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
 from ..types import Frame, FrameError, InputError, Sequence
+from .ahead import preparation
 from .checkpoint import Checkpoint, load_checkpoint
 from .control import Control, Turn
 from .driven import Abandoned, SlamFactory, make_slam
@@ -194,7 +195,9 @@ class Engine:
         else:
             folder = RunFolder.reopen(plan.out, resumed.frame, self._not_saved)
         run = Run(plan, folder, self._emit, self._make, self._checkpoint_every, resumed)
-        self._ahead = datasets.Prefetch(plan.sequence, range(run.tally.position, len(plan.sequence)))
+        coming = range(run.tally.position, len(plan.sequence))
+        prepare = preparation(lambda: run.config, plan.device)
+        self._ahead = datasets.Prefetch(plan.sequence, coming, prepare=prepare)
         return run
 
     def _one_run(self) -> Turn:

@@ -1,0 +1,40 @@
+"""What can be done for a frame before its turn comes, by the threads that read it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ..config import Config
+from ..types import Frame
+
+
+def preparation(config: Callable[[], Config], device: str) -> Callable[[Frame], Frame]:
+    """Find the corners of frames that will need them, and put images for a GPU where it can fetch them by itself.
+
+    config: asked for every frame. What is missing, or was found with other settings, is made good when it is needed.
+    """
+
+    def prepare(frame: Frame) -> Frame:
+        from ..pixels import find_corners  # torch is not imported at the start
+
+        now = config()
+        if now.fus and (now.tracking.iterations > 0 or frame.index % now.keyframe_every == 0):
+            frame = replace(frame, corners=find_corners(frame.color, now))
+        if device.startswith("cuda"):
+            frame = replace(frame, color=pinned(frame.color), depth=pinned(frame.depth))
+        return frame
+
+    return prepare
+
+
+def pinned(array: np.ndarray) -> np.ndarray:
+    """A copy in page-locked memory, or the array itself where there is none to be had."""
+    import torch
+
+    try:
+        return np.asarray(torch.from_numpy(array).pin_memory().numpy())
+    except RuntimeError:
+        return array

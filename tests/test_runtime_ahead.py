@@ -1,0 +1,68 @@
+"""What the reading threads do for a frame before its turn."""
+
+import numpy as np
+import pytest
+import torch
+
+from ecslam import pixels
+from ecslam.config import Config, apply_settings, load_preset
+from ecslam.datasets import Prefetch, open_sequence
+from ecslam.pixels import choose_pixels, feature_points, find_corners
+from ecslam.runtime import ahead
+from ecslam.runtime.ahead import preparation
+
+ROOM = open_sequence("synthetic/studio?size=160x120&frames=8")
+FEW = apply_settings(Config(), ["feature_count=40"])
+
+
+@pytest.mark.parametrize(("preset", "found"), [("lite", range(8)), ("live", (0, 5))])
+def test_corners_are_found_ahead_for_the_frames_that_need_them(preset, found):
+    config = load_preset(preset)
+    frames = [frame for _, frame in Prefetch(ROOM, prepare=preparation(lambda: config, "cpu"))]
+    assert [frame.index for frame in frames if frame.corners is not None] == list(found)
+
+
+def test_without_fus_nobody_looks_for_corners():
+    config = apply_settings(load_preset("lite"), ["fus=false"])
+    assert preparation(lambda: config, "cpu")(ROOM[0]).corners is None
+
+
+@pytest.mark.parametrize("limit", [1, 7, 40, 500])
+def test_the_first_corners_are_the_strongest_whoever_found_them(limit):
+    frame = ROOM[0]
+    prepared = preparation(lambda: FEW, "cpu")(frame)
+    one, other = (feature_points(f, FEW, limit) for f in (frame, prepared))
+    assert np.array_equal(one, other)
+    assert np.array_equal(one, find_corners(frame.color, apply_settings(FEW, [f"feature_count={limit}"])).index[:40])
+
+
+def test_prepared_frames_are_not_searched_again(monkeypatch):
+    frame = preparation(lambda: FEW, "cpu")(ROOM[0])
+    expected = choose_pixels(ROOM[0], ROOM.intrinsics, 200, FEW, np.random.default_rng(0))
+    monkeypatch.setattr(pixels, "find_corners", lambda *_: pytest.fail("searched again"))
+    found = choose_pixels(frame, ROOM.intrinsics, 200, FEW, np.random.default_rng(0))
+    assert np.array_equal(found.direction, expected.direction)
+
+
+@pytest.mark.parametrize(
+    "change", ["feature_count=30", "feature_quality=0.3", "feature_distance_px=20", "border_px=25"]
+)
+def test_corners_found_with_other_settings_are_looked_for_again(change):
+    now = apply_settings(FEW, [change])
+    stale = preparation(lambda: FEW, "cpu")(ROOM[0])
+    assert np.array_equal(feature_points(stale, now, 40), find_corners(ROOM[0].color, now).index)
+    assert not np.array_equal(feature_points(stale, now, 40), stale.corners.index)
+
+
+def test_images_for_a_gpu_are_put_where_it_can_fetch_them(monkeypatch):
+    monkeypatch.setattr(ahead, "pinned", lambda array: array.copy() + 1)
+    frame = ROOM[0]
+    prepared = preparation(lambda: FEW, "cuda:0")(frame)
+    assert np.array_equal(prepared.color, frame.color + 1)
+    assert np.array_equal(prepared.depth, frame.depth + 1)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has it")
+def test_without_page_locked_memory_images_stay_where_they_are():
+    frame = ROOM[0]
+    assert preparation(lambda: FEW, "cuda")(frame).color is frame.color
