@@ -10,20 +10,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from .config import Config
+from .descent import Alignment, descend, objective
 from .field import TsdfField
 from .kernels import AlignSettings, Backend, NormalEquations
 from .observed import ObservedVoxels
 from .pixels import Pixels, Points
 
-DAMPING = (1e-4, 1e-8, 1e4)
-SETTLED = 1e-4
-COARSE_STRIDE = 4
 WIDE_GRADIENT = (0.3, 2.0)
 LEAST_KNOWN = 100
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255
@@ -38,6 +35,12 @@ class Surface(Protocol):
 
     def normal_equations(self, c2w: NDArray[np.float64], points: Points, settings: AlignSettings) -> NormalEquations:
         """See ``kernels.reference.normal_equations``; the sums lie on the CPU."""
+        ...
+
+    def descend(
+        self, points: Points, guess: NDArray[np.float64], settings: Sequence[AlignSettings], iterations: int
+    ) -> Alignment:
+        """See ``descent.descend``."""
         ...
 
 
@@ -64,13 +67,11 @@ class LearnedSurface:
         found = self.kernels.normal_equations(layout, params, pose, local, light, settings)
         return replace(found, jtj=found.jtj.cpu(), jtr=found.jtr.cpu())
 
-
-@dataclass(frozen=True)
-class Alignment:
-    """c2w: float64 [4, 4]. cost: robust objective per point, in squared metres."""
-
-    c2w: NDArray[np.float64]
-    cost: float
+    def descend(
+        self, points: Points, guess: NDArray[np.float64], settings: Sequence[AlignSettings], iterations: int
+    ) -> Alignment:
+        """See ``Surface``."""
+        return descend(self, points, guess, settings, iterations)
 
 
 def stages(config: Config) -> list[AlignSettings]:
@@ -103,7 +104,7 @@ def known_points(surface: Surface, pixels: Pixels, guess: NDArray[np.float64]) -
 
 def align(surface: Surface, points: Points, guess: NDArray[np.float64], config: Config) -> Alignment:
     """Move ``points`` from ``guess`` [4, 4] onto the surface, coarse to fine."""
-    return descend(surface, points, guess, stages(config), config.align.iterations)
+    return surface.descend(points, guess, stages(config), config.align.iterations)
 
 
 def cost_at(surface: Surface, points: Points, c2w: NDArray[np.float64], config: Config) -> float:
@@ -111,58 +112,6 @@ def cost_at(surface: Surface, points: Points, c2w: NDArray[np.float64], config: 
     last = stages(config)[-1]
     found = surface.normal_equations(c2w, points, last)
     return objective(found, len(points.local), last) / max(len(points.local), 1)
-
-
-def descend(
-    surface: Surface,
-    points: Points,
-    guess: NDArray[np.float64],
-    settings: Sequence[AlignSettings],
-    iterations: int,
-) -> Alignment:
-    """Levenberg-Marquardt from ``guess`` [4, 4] through all ``settings``, at most ``iterations`` steps with each; all
-    stages but the last take every fourth point."""
-    everything, c2w, total, cost = points, guess, 0, 0.0
-    for stage in settings:
-        points = everything if stage is settings[-1] else everything.every(COARSE_STRIDE)
-        total = len(points.local)
-        equations = surface.normal_equations(c2w, points, stage)
-        damping = DAMPING[0]
-        for _ in range(iterations):
-            if equations.used < 6:
-                break
-            jtj = equations.jtj.numpy()
-            move = -np.linalg.solve(jtj + damping * np.diag(jtj.diagonal() + 1e-9), equations.jtr.numpy())
-            trial = moved(c2w, move)
-            found = surface.normal_equations(trial, points, stage)
-            before, after = objective(equations, total, stage), objective(found, total, stage)
-            size = float(np.abs(move).max())
-            if after < before:
-                c2w, equations, damping = trial, found, max(damping / 3, DAMPING[1])
-                if before - after < SETTLED * before or size < 1e-5:
-                    break
-            else:
-                damping *= 10
-                if damping > DAMPING[2] or size < 1e-6:
-                    break
-        cost = objective(equations, total, stage)
-    return Alignment(c2w, cost / max(total, 1))
-
-
-def moved(c2w: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``se3.retract`` of one pose [4, 4] by xi [6], without the cost of torch's small tensors."""
-    out = c2w.copy()
-    out[:3, :3] = cv2.Rodrigues(xi[3:])[0] @ c2w[:3, :3]
-    out[:3, 3] += xi[:3]
-    return out
-
-
-def objective(equations: NormalEquations, total: int, settings: AlignSettings) -> float:
-    """Robust cost in which a dropped point counts as an outlier, so that dropping points never pays."""
-    worst = settings.kernel_m**2
-    if settings.colour_weight > 0:
-        worst += (settings.colour_weight * settings.colour_kernel) ** 2
-    return equations.cost + 0.5 * worst * (total - equations.used)
 
 
 def transform(c2w: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float64]:

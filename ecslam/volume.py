@@ -3,6 +3,7 @@ needs no training (Curless and Levoy 1996; sparse blocks as in Niessner et al. 2
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .descent import Alignment, descend
 from .kernels import AlignSettings, NormalEquations, fusion
 from .pixels import Points
 from .types import Frame, Intrinsics
@@ -94,6 +96,12 @@ class FusedVolume:
         upper = np.triu(sums[:36].reshape(6, 6))
         jtj = torch.from_numpy(upper + np.triu(upper, 1).T)
         return NormalEquations(jtj, torch.from_numpy(sums[36:42]), float(sums[42]), int(sums[44]), int(sums[43]))
+
+    def descend(
+        self, points: Points, guess: NDArray[np.float64], settings: Sequence[AlignSettings], iterations: int
+    ) -> Alignment:
+        """See ``descent.descend``."""
+        return descend(self, points, guess, settings, iterations)
 
 
 @cache

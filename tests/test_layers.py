@@ -21,7 +21,7 @@ LAYERS = (
     ("se3",),
     ("kernels",),
     ("field",),
-    ("pixels", "samples", "rays", "rendering", "losses", "datasets", "observed", "volume"),
+    ("pixels", "samples", "rays", "rendering", "losses", "datasets", "observed", "volume", "descent"),
     ("keyframes", "window", "trajectory", "pixel_bank", "draws", "pose_adam", "field_adam", "views", "saving"),
     ("align", "tracker", "mapper", "loops", "recovery", "meshing", "meshing_blocks", "meshing_table", "evaluation"),
     ("slam",),

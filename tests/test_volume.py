@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from ecslam import se3, volume
-from ecslam.align import align, cost_at, known_points, moved, stages
+from ecslam.align import align, cost_at, known_points, stages
 from ecslam.config import Config
+from ecslam.descent import moved
 from ecslam.pixels import spread_pixels
 from ecslam.types import Frame, Intrinsics
 from ecslam.volume import FusedVolume
