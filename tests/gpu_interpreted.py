@@ -146,7 +146,7 @@ def test_a_block_may_meet_many_poses_and_skip_some():
 
 def test_programs_that_take_several_blocks(monkeypatch):
     monkeypatch.setattr(gpu, "PROGRAMS_A_PROCESSOR", 1)
-    monkeypatch.setattr(gpu, "_processors", lambda device: 1)
+    monkeypatch.setattr(gpu, "processors", lambda device: 1)
     assert_step(make_field(), *make_rays(40, 4))
 
 

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import os
 import weakref
-from contextlib import AbstractContextManager, nullcontext
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +22,7 @@ if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
     raise ImportError("no CUDA device")
 
 from ._gpu_align import SUMS, align_kernel, gradients_kernel
+from ._gpu_device import beside, processors
 from ._gpu_field import Field, Shape
 from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, values_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
@@ -96,15 +95,6 @@ def _ray_grid(rays: int, samples: int) -> tuple[tuple[int], dict[str, int]]:
     return (-(-rays // block),), {"block": block, "padded": padded}
 
 
-def _processors(device: torch.device) -> int:
-    return torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
-
-
-def _beside(tensor: Tensor) -> AbstractContextManager[Any]:
-    """Triton launches on the current device: make it the tensor's."""
-    return torch.cuda.device(tensor.device) if tensor.is_cuda else nullcontext()
-
-
 def _evaluate(
     layout: GridLayout, field: Field, points: Points, from_rays: bool, features: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -120,7 +110,7 @@ def _evaluate(
 
 def values(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor]:
     """See ``reference.values``."""
-    with _beside(points):
+    with beside(points):
         return _evaluate(layout, _field(layout, params), _places(points), False)
 
 
@@ -130,7 +120,7 @@ def gradients(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[
     new = given.position.new_empty
     found = new(n), new(n, 3), new(n), new(n, 3)
     if n:
-        with _beside(points):
+        with beside(points):
             gradients_kernel[(_blocks(n),)](_field(layout, params), given, *found, shape=_shape(layout), block=BLOCK)
     return found
 
@@ -142,7 +132,7 @@ def render(layout: GridLayout, params: FieldParams, c2w: Tensor, rays: RayBatch)
     color, depth, weights = z.new_zeros(targets.rays, 3), z.new_zeros(targets.rays), torch.zeros_like(z)
     if z.numel():
         grid, sizes = _ray_grid(targets.rays, targets.samples)
-        with _beside(z):
+        with beside(z):
             sdf, rgb = _evaluate(layout, _field(layout, params), _samples(c2w, rays), True)
             render_kernel[grid](targets, sdf, rgb, _flat(params.beta), color, depth, weights, **sizes)
     return color, depth, weights
@@ -162,7 +152,7 @@ def step(
     out = targets.z.new_empty(5 + 12 * poses)
     losses, d_c2w = out[:5], out[5:].view(poses, 3, 4)
     learnt = [] if into is None else [into.table, into.w_in, into.w_sdf, into.w_rgb, into.beta]
-    with _beside(out):
+    with beside(out):
         torch._foreach_zero_([out, *learnt])
         if targets.z.numel():
             _step(layout, params, _samples(c2w, rays), targets, weights, into, losses, d_c2w if want_poses else None)
@@ -192,7 +182,7 @@ def _step(
     wanted = {"want_params": into is not None, "want_poses": d_c2w is not None}
     sink = Into(*(getattr(into or params, name) for name in Into._fields))
     blocks, d_world = _blocks(points.total), beta.new_empty(points.total, 3)
-    programs = blocks if into is None else min(blocks, PROGRAMS_A_PROCESSOR * _processors(losses.device))
+    programs = blocks if into is None else min(blocks, PROGRAMS_A_PROCESSOR * processors(losses.device))
     decoders_kernel[(programs,)](
         field, points, sdf, rgb, features, d_world, sink, blocks, **wanted, shape=shape, block=BLOCK
     )
@@ -210,7 +200,7 @@ def normal_equations(
     sums = torch.zeros(SUMS, dtype=torch.float64, device=points.device)
     if n:
         numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
-        with _beside(points):
+        with beside(points):
             align_kernel[(_blocks(n),)](
                 _field(layout, params), _places(points, c2w), _flat(luminance), numbers, sums,
                 colour=settings.colour_weight > 0, shape=_shape(layout), block=BLOCK,
