@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -17,6 +17,9 @@ from .descent import Alignment, descend
 from .kernels import AlignSettings, NormalEquations, fusion
 from .pixels import Points
 from .types import Frame, Intrinsics
+
+if TYPE_CHECKING:
+    from .volume_gpu import GpuVolume
 
 STRIDE = 4
 ROWS, LISTED = 4096, 16384
@@ -102,6 +105,15 @@ class FusedVolume:
     ) -> Alignment:
         """See ``descent.descend``."""
         return descend(self, points, guess, settings, iterations)
+
+
+def create_volume(kernels: str, voxel_m: float, truncation_m: float, device: torch.device) -> FusedVolume | GpuVolume:
+    """An empty volume where the back end ``kernels`` computes: on ``device`` for ``gpu``, else on the CPU."""
+    if kernels != "gpu":
+        return FusedVolume(voxel_m, truncation_m)
+    from .volume_gpu import GpuVolume
+
+    return GpuVolume(voxel_m, truncation_m, device)
 
 
 @cache
