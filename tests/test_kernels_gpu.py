@@ -15,7 +15,8 @@ HERE = Path(__file__).parent
 
 
 @pytest.mark.slow
-def test_every_kernel_agrees_with_the_reference_in_the_interpreter():
+@pytest.mark.parametrize("checks", ["gpu_interpreted.py", "gpu_volume_interpreted.py"])
+def test_every_kernel_agrees_with_the_reference_in_the_interpreter(checks):
     pytest.importorskip("triton", reason="Triton is not installed, so the GPU kernels are not checked")
     environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
     command = [
@@ -25,7 +26,7 @@ def test_every_kernel_agrees_with_the_reference_in_the_interpreter():
         "-p",
         "no:cacheprovider",
         "--timeout=0",
-        str(HERE / "gpu_interpreted.py"),
+        str(HERE / checks),
     ]
     done = subprocess.run(command, env=environment, cwd=HERE, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]

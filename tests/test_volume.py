@@ -5,46 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from planes import CAMERA, corner, look, pose
 
 from ecslam import se3, volume
 from ecslam.align import align, cost_at, known_points, stages
 from ecslam.config import Config
 from ecslam.descent import moved
 from ecslam.pixels import spread_pixels
-from ecslam.types import Frame, Intrinsics
-from ecslam.volume import FusedVolume
+from ecslam.volume import FusedVolume, create_volume
 
-CAMERA = Intrinsics(160.0, 160.0, 79.5, 59.5, 160, 120)
 CONFIG = Config(border_px=4)
-
-
-def rays():
-    v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
-    return np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
-
-
-def look(c2w, planes):
-    """What a camera sees of planes (n, d) with n . x = d: depth, and a smooth texture fixed in the world."""
-    direction = rays() @ c2w[:3, :3].T
-    depth = np.full(direction.shape[:2], np.inf)
-    for n, d in planes:
-        with np.errstate(divide="ignore"):
-            t = (d - c2w[:3, 3] @ n) / (direction @ n)
-        depth = np.where((t > 0) & (t < depth), t, depth)
-    hit = np.isfinite(depth)
-    point = c2w[:3, 3] + direction * np.where(hit, depth, 0)[..., None]
-    light = 0.5 + 0.25 * (np.sin(9 * point[..., 0]) + np.cos(8 * point[..., 1] + 3 * point[..., 2]))
-    color = np.repeat((255 * light).round().astype(np.uint8)[..., None], 3, -1)
-    return Frame(0, 0.0, color, np.where(hit, depth, 0).astype(np.float32))
-
-
-def corner():
-    return [(np.array([0, 0, 1.0]), 2.0), (np.array([0, 1.0, 0]), 0.7), (np.array([1.0, 0, 0]), 0.9)]
-
-
-def pose(rotation_deg=(0, 0, 0), centre=(0, 0, 0)):
-    xi = torch.tensor([*centre, *np.radians(rotation_deg)], dtype=torch.float64)
-    return se3.retract(torch.eye(4, dtype=torch.float64), xi).numpy()
 
 
 def fused(planes, poses, voxel_m=0.02):
@@ -158,6 +128,11 @@ def test_colour_holds_what_a_plain_wall_leaves_free():
     without = align(found, points, guess, replace(CONFIG, align=replace(CONFIG.align, colour_weight_m=0.0))).c2w
     assert np.linalg.norm(with_colour[:3, 3] - true[:3, 3]) < 3e-3
     assert np.linalg.norm(without[:3, 3] - true[:3, 3]) > 0.01
+
+
+@pytest.mark.parametrize("kernels", ["reference", "cpu"])
+def test_without_gpu_kernels_the_volume_is_on_the_cpu(kernels):
+    assert isinstance(create_volume(kernels, 0.02, 0.06, torch.device("cuda")), FusedVolume)
 
 
 def test_moved_is_retract():

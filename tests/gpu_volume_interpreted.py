@@ -1,0 +1,249 @@
+"""The fused volume's GPU kernels in Triton's interpreter against those on the CPU.
+
+Not collected by itself: ``test_kernels_gpu.py`` runs it in a process of its own (see ``gpu_interpreted.py``). Images
+are tiny and blocks larger than on a GPU, since the interpreter's time goes by programs.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from kernel_cases import relative_rms
+from planes import corner, look, pose
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from ecslam import volume_gpu
+from ecslam.align import align, known_points, stages
+from ecslam.config import AlignConfig, Config
+from ecslam.kernels import fusion_gpu
+from ecslam.pixels import Points, spread_pixels
+from ecslam.types import Intrinsics
+from ecslam.volume import FusedVolume, create_volume
+from ecslam.volume_gpu import GpuVolume
+
+torch.set_num_threads(1)
+CPU = torch.device("cpu")
+CAMERA = Intrinsics(48.0, 48.0, 23.6, 17.3, 48, 36)
+LENGTHS = (0.04, 0.11)  # no voxel of the corner lies exactly a truncation away
+CONFIG = Config(border_px=1, truncation_m=0.11, align=AlignConfig(gradient_range=(0.5, 1.5)))
+POSES = (
+    pose((0.3, -0.2, 0.1), (0.013, 0.007, 0.003)),
+    pose((0.4, 6.0, 2.0), (-0.011, 0.002, 0.017)),
+    pose((4.0, -5.0, 0.3), (0.021, 0.012, 0.001)),
+)
+TRUE, GUESS, FAR_GUESS = pose((2, 3, -1), (0.02, 0.01, -0.02)), pose((3, 2, 0), (0.05, -0.01, 0.01)), pose((3, -9, 6))
+
+
+@pytest.fixture(autouse=True)
+def large_blocks(monkeypatch):
+    monkeypatch.setattr(fusion_gpu, "BLOCK", 4096)
+    monkeypatch.setattr(fusion_gpu, "POINTS", 512)
+    monkeypatch.setattr(volume_gpu, "SLOTS", 1 << 9)
+    monkeypatch.setattr(volume_gpu, "LEAST_POINTS", 64)
+
+
+def frame(c2w, camera=CAMERA):
+    """The corner with noise, holes, an edge in depth and colours."""
+    seen, rng = look(c2w, corner(), camera), np.random.default_rng(0)
+    depth = seen.depth + rng.normal(0, 0.004, seen.depth.shape).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.05] = 0
+    depth[20:, 30:] -= 0.4 * (depth[20:, 30:] > 0)
+    return replace(seen, depth=depth, color=rng.integers(0, 256, seen.color.shape, np.uint8))
+
+
+def both(frames, poses=POSES):
+    """The volume on the CPU and that in the interpreter, after the same frames."""
+    volumes = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, CPU)
+    for volume in volumes:
+        add(volume, frames, poses)
+    return volumes
+
+
+def add(volume, frames, poses=POSES, far_m=8.0):
+    for seen, c2w in zip(frames, poses, strict=True):
+        volume.integrate(seen, replace(CAMERA, width=seen.depth.shape[1]), c2w, 0.1, far_m)
+
+
+def assert_alike(theirs, mine, off=0):
+    """The same blocks, and voxels that differ by at most one unit but for ``off`` of them."""
+    (place, voxels), (my_place, my_voxels) = ordered(theirs), ordered(mine)
+    np.testing.assert_array_equal(place, my_place)
+    assert mine.used == theirs.used == len(place)
+    assert (voxels[..., 2] > 0).sum() > 1000
+    assert (np.abs(voxels.astype(np.int64) - my_voxels) > 1).any(2).sum() <= off
+
+
+def ordered(volume):
+    state = volume.state()
+    order = np.argsort(state["place"])
+    return state["place"][order], state["voxels"][order]
+
+
+def corners():
+    return [look(c2w, corner(), CAMERA) for c2w in POSES]
+
+
+def measured(count, guess=GUESS):
+    """Points of the corner seen from TRUE, and their luminance; some are unknown."""
+    pixels = spread_pixels(look(TRUE, corner(), CAMERA), CAMERA, 400, CONFIG, np.random.default_rng(2))
+    points = known_points(FusedVolume(*LENGTHS), pixels, guess)
+    local, light = points.local[:count], points.light[:count]
+    return Points(local + 0.4 * (torch.arange(len(local)) % 7 == 3)[:, None], light)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fusion_gpu, "BLOCK", 4096)
+        patch.setattr(volume_gpu, "SLOTS", 1 << 9)
+        return both(corners())
+
+
+def test_frames_are_averaged_in_as_on_the_cpu(pair):
+    assert_alike(*pair)
+
+
+@pytest.mark.parametrize("width", [48, 47])
+def test_noise_holes_edges_and_colours(width):
+    frames = [frame(c2w, replace(CAMERA, width=width)) for c2w in POSES]
+    assert_alike(*both(frames), off=2)
+
+
+def test_weights_have_a_limit(pair):
+    state = pair[0].state()
+    state["voxels"][..., 2] = np.where(state["voxels"][..., 2] > 0, 199, 0)
+    theirs, mine = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, CPU)
+    for volume in (theirs, mine):
+        volume.load(state)
+        add(volume, corners()[:1], POSES[:1])
+    assert ordered(theirs)[1][..., 2].max() == 200
+    assert_alike(theirs, mine)
+
+
+def test_depth_out_of_range_adds_nothing():
+    volume = GpuVolume(*LENGTHS, CPU)
+    add(volume, corners()[:1], POSES[:1], far_m=0.3)
+    assert volume.used == 0
+    assert not volume.distances(np.zeros((3, 3)))[1].any()
+    assert volume.state()["place"].shape == (0,)
+
+
+@pytest.mark.parametrize("count", [0, 1, 511, 512, 513, 3000])
+def test_distances(pair, count):
+    points = np.random.default_rng(1).uniform((-0.9, -0.9, 1.5), (1, 0.8, 2.1), (count, 3))
+    (theirs, known), (mine, mine_known) = (volume.distances(points) for volume in pair)
+    assert (mine.dtype, mine_known.dtype) == (theirs.dtype, known.dtype)
+    np.testing.assert_array_equal(mine_known, known)
+    assert count < 3000 or 100 < known.sum() < 2900
+    np.testing.assert_allclose(mine[known], theirs[known], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("count", "colour"), [(0, 0.1), (1, 0.1), (63, 0.0), (64, 0.1), (65, 0.1), (300, 0.1), (300, 0.0)]
+)
+def test_normal_equations(pair, count, colour):
+    for stage in stages(CONFIG):
+        settings = replace(stage, colour_weight=colour)
+        theirs, mine = (volume.normal_equations(GUESS, measured(count), settings) for volume in pair)
+        assert (mine.used, mine.inliers) == (theirs.used, theirs.inliers)
+        assert count < 60 or theirs.used > 0.7 * count
+        assert mine.cost == pytest.approx(theirs.cost, rel=1e-4)
+        assert mine.jtj.dtype == mine.jtr.dtype == torch.float64
+        assert relative_rms(mine.jtj, theirs.jtj) < 1e-4
+        assert relative_rms(mine.jtr, theirs.jtr) < 1e-4
+
+
+@pytest.mark.parametrize(("count", "guess"), [(c, GUESS) for c in (0, 1, 5, 63, 64, 65, 300)] + [(300, FAR_GUESS)])
+def test_a_descent_ends_where_that_on_the_cpu_does(pair, count, guess):
+    theirs, mine = (align(volume, measured(count), guess, CONFIG) for volume in pair)
+    np.testing.assert_allclose(mine.c2w, theirs.c2w, atol=1e-5)
+    assert mine.cost == pytest.approx(theirs.cost, rel=1e-4)
+
+
+class Counting(FusedVolume):
+    """Keeps the costs it was asked for."""
+
+    def normal_equations(self, c2w, points, settings):
+        found = super().normal_equations(c2w, points, settings)
+        self.costs.append(found.cost)
+        return found
+
+
+@pytest.mark.parametrize("iterations", [1, 4, 10, 40])
+def test_a_descent_that_refuses_steps(iterations):
+    frames, theirs = [frame(c2w) for c2w in POSES], Counting(*LENGTHS)
+    theirs.costs = []
+    add(theirs, frames)
+    mine = GpuVolume(*LENGTHS, CPU)
+    mine.load(theirs.state())
+    settings = stages(replace(CONFIG, align=replace(CONFIG.align, colour_weight_m=1.0)))[:1]
+    points = measured(300)
+    expected = theirs.descend(points, FAR_GUESS, settings, iterations)
+    found = mine.descend(points, FAR_GUESS, settings, iterations)
+    assert iterations < 10 or np.diff(theirs.costs).max() > 0
+    np.testing.assert_allclose(found.c2w, expected.c2w, atol=1e-5)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-4)
+
+
+def test_a_full_table_grows_and_loses_nothing_for_long(monkeypatch):
+    monkeypatch.setattr(volume_gpu, "SLOTS", 16)
+    theirs, mine, grown = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, CPU), []
+    add(theirs, corners()[:1], POSES[:1])
+    for _ in range(5):
+        add(mine, corners()[:1], POSES[:1])
+        grown.append((mine.used, mine._blocks.slots))
+    assert grown == [(16, 16), (32, 32), (64, 64), (66, 128), (66, 256)]
+    (place, voxels), (my_place, my_voxels) = ordered(theirs), ordered(mine)
+    np.testing.assert_array_equal(my_place, place)
+    np.testing.assert_array_equal(my_voxels[..., 2] > 0, voxels[..., 2] > 0)
+
+
+def test_growing_changes_nothing(monkeypatch, pair):
+    monkeypatch.setattr(volume_gpu, "COPIED", 16)
+    mine = GpuVolume(*LENGTHS, CPU)
+    mine.load(pair[1].state())
+    rows = fusion_gpu.taken_slots(mine._blocks)
+    mine._load(mine._blocks.keys[rows], mine._blocks.voxels, rows, 2 * mine._blocks.slots)
+    for old, new in zip(ordered(pair[1]), ordered(mine), strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_state_goes_round_through_both(pair):
+    theirs, mine = FusedVolume(*LENGTHS), create_volume("gpu", *LENGTHS, CPU)
+    theirs.load(pair[1].state())
+    mine.load(pair[0].state())
+    add(theirs, corners()[:1], POSES[2:])
+    add(mine, corners()[:1], POSES[2:])
+    assert_alike(theirs, mine)
+
+
+class NoWaiting(TorchDispatchMode):
+    """Refuses what makes the host wait for a device, or sends it something."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        assert name not in ("_local_scalar_dense", "nonzero", "masked_select", "_to_copy", "_unique2"), name
+        masks = [t for t in args[1] if t is not None and t.dtype == torch.bool] if name.startswith("index") else []
+        assert not masks, name
+        return func(*args, **kwargs or {})
+
+
+class Unlaunched:
+    """A kernel that is not run."""
+
+    def __getitem__(self, grid):
+        return lambda *args, **kwargs: None
+
+
+def test_nothing_waits_for_the_host(monkeypatch):
+    """On the meta device no value can be read at all."""
+    for name in [name for name in vars(fusion_gpu) if name.endswith("_kernel")]:
+        monkeypatch.setattr(fusion_gpu, name, Unlaunched())
+    blocks, listed = fusion_gpu.allocate(64, *LENGTHS, torch.device("meta"))
+    points, start = torch.zeros(64, 4, device="meta"), fusion_gpu.pack_start(torch.eye(4), 50).to("meta")
+    depth, color = torch.zeros(36, 48, device="meta"), torch.zeros(36, 48, 3, dtype=torch.uint8, device="meta")
+    with NoWaiting():
+        fusion_gpu.fuse(blocks, listed, depth, color, torch.zeros(19, device="meta"), 4, 3)
+        row = fusion_gpu.descend(blocks, points, start, tuple(stages(CONFIG)), 10, 4, volume_gpu.RULES)
+    assert row.shape == start.shape

@@ -1,0 +1,37 @@
+"""What a camera sees of a few planes: exact depth, and a smooth texture fixed in the world."""
+
+import numpy as np
+import torch
+
+from ecslam import se3
+from ecslam.types import Frame, Intrinsics
+
+CAMERA = Intrinsics(160.0, 160.0, 79.5, 59.5, 160, 120)
+
+
+def look(c2w, planes, camera=CAMERA):
+    """What a camera at c2w [4, 4] sees of planes (n, d) with n . x = d."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+    direction = rays @ c2w[:3, :3].T
+    depth = np.full(direction.shape[:2], np.inf)
+    for n, d in planes:
+        with np.errstate(divide="ignore"):
+            t = (d - c2w[:3, 3] @ n) / (direction @ n)
+        depth = np.where((t > 0) & (t < depth), t, depth)
+    hit = np.isfinite(depth)
+    point = c2w[:3, 3] + direction * np.where(hit, depth, 0)[..., None]
+    light = 0.5 + 0.25 * (np.sin(9 * point[..., 0]) + np.cos(8 * point[..., 1] + 3 * point[..., 2]))
+    color = np.repeat((255 * light).round().astype(np.uint8)[..., None], 3, -1)
+    return Frame(0, 0.0, color, np.where(hit, depth, 0).astype(np.float32))
+
+
+def corner():
+    """Three walls."""
+    return [(np.array([0, 0, 1.0]), 2.0), (np.array([0, 1.0, 0]), 0.7), (np.array([1.0, 0, 0]), 0.9)]
+
+
+def pose(rotation_deg=(0, 0, 0), centre=(0, 0, 0)):
+    """c2w [4, 4] of a rotation vector and a centre."""
+    xi = torch.tensor([*centre, *np.radians(rotation_deg)], dtype=torch.float64)
+    return se3.retract(torch.eye(4, dtype=torch.float64), xi).numpy()
