@@ -33,7 +33,7 @@ from .tracker import TrackResult, fit, track_adam, track_direct
 from .trajectory import Trajectory
 from .types import Frame, FrameError, InputError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
-from .volume import FusedVolume
+from .volume import create_volume
 from .window import random_window, select_window
 
 Interrupt = Callable[[], None]
@@ -76,8 +76,8 @@ class Slam:
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._observed = ObservedVoxels()
-        fused = config.align.to == "fused"
-        self._volume = FusedVolume(config.align.voxel_m, config.truncation_m) if fused else None
+        lengths, fused = (config.align.voxel_m, config.truncation_m), config.align.to == "fused"
+        self._volume = create_volume(self.kernels_name, *lengths, self.device) if fused else None
         self._loops, self._recovery = LoopDetector(), Recovery()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
         self._pending: Future[MapResult] | None = None
