@@ -207,7 +207,7 @@ class Slam:
             pixels = choose_pixels(frame, self.intrinsics, config.tracking.rays, config, self._rng)
             pixels = self._known(pixels, c2w)
             rendered, losses = track_adam(
-                self._require_field(), self._kernels, pixels, c2w, config, self._generator, self._recorder
+                self._require_field(), self._kernels, pixels, c2w, config, self._jitter(), self._recorder
             )
             agreed = WORSE * cost_at(surface, points, c2w, config)
             if config.align.to == "none" or cost_at(surface, points, rendered, config) <= agreed:
@@ -219,6 +219,12 @@ class Slam:
 
     def _learned(self) -> LearnedSurface:
         return LearnedSurface(self._require_field(), self._kernels, self.config.truncation_m, self._observed)
+
+    def _jitter(self) -> torch.Generator:
+        """Random numbers on the device. The state of a GPU's own generator would mean nothing to a checkpoint."""
+        if self.device.type == "cpu":
+            return self._generator
+        return torch.Generator(self.device).manual_seed(int(self._rng.integers(2**62)))
 
     def _known(self, pixels: Pixels, guess: NDArray[np.float64]) -> Pixels:
         """The pixels whose measured point, seen from ``guess``, lies where the map has been observed; all of them when

@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from fake_graphs import Forbidding, launch_nothing
 from kernel_cases import (
     ALIGN,
     BOX,
@@ -194,3 +195,16 @@ def test_a_layout_is_uploaded_once_and_forgotten_with_it():
     before = len(gpu._layouts)
     del field
     assert len(gpu._layouts) == before - 1
+
+
+@pytest.mark.parametrize(("want_params", "want_poses"), [(True, True), (True, False), (False, True)])
+def test_no_step_waits_for_the_gpu(monkeypatch, want_params, want_poses):
+    """On the meta device no value can be read at all."""
+    launch_nothing(monkeypatch, gpu)
+    field, (c2w, rays) = make_field(), make_rays(40, 4)
+    params, rays = (type(t)(*(getattr(t, f.name).to("meta") for f in fields(t))) for t in (field.params, rays))
+    c2w, mine = c2w.to("meta"), blank(params) if want_params else None
+    gpu.step(field.layout, params, c2w, rays, WEIGHTS, mine, want_poses)  # uploads the layout, once
+    with Forbidding():
+        found = gpu.step(field.layout, params, c2w, rays, WEIGHTS, mine, want_poses)
+    assert found.losses.device.type == "meta"

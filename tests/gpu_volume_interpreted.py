@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fake_graphs import Forbidding, launch_nothing
 from kernel_cases import relative_rms
 from planes import corner, look, pose
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from ecslam import volume_gpu
 from ecslam.align import align, known_points, stages
@@ -256,32 +256,13 @@ def test_state_goes_round_through_both(pair):
     assert_alike(theirs, mine)
 
 
-class NoWaiting(TorchDispatchMode):
-    """Refuses what makes the host wait for a device, or sends it something."""
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        name = func.overloadpacket.__name__
-        assert name not in ("_local_scalar_dense", "nonzero", "masked_select", "_to_copy", "_unique2"), name
-        masks = [t for t in args[1] if t is not None and t.dtype == torch.bool] if name.startswith("index") else []
-        assert not masks, name
-        return func(*args, **kwargs or {})
-
-
-class Unlaunched:
-    """A kernel that is not run."""
-
-    def __getitem__(self, grid):
-        return lambda *args, **kwargs: None
-
-
 def test_nothing_waits_for_the_host(monkeypatch):
     """On the meta device no value can be read at all."""
-    for name in [name for name in vars(fusion_gpu) if name.endswith("_kernel")]:
-        monkeypatch.setattr(fusion_gpu, name, Unlaunched())
+    launch_nothing(monkeypatch, fusion_gpu)
     blocks, listed = fusion_gpu.allocate(64, *LENGTHS, torch.device("meta"))
     points, start = torch.zeros(64, 4, device="meta"), fusion_gpu.pack_start(torch.eye(4), 50).to("meta")
     depth, color = torch.zeros(36, 48, device="meta"), torch.zeros(36, 48, 3, dtype=torch.uint8, device="meta")
-    with NoWaiting():
+    with Forbidding():
         fusion_gpu.fuse(blocks, listed, depth, color, torch.zeros(19, device="meta"), 4, 3)
         row = fusion_gpu.descend(blocks, points, start, tuple(stages(CONFIG)), 10, 4, volume_gpu.RULES)
     assert row.shape == start.shape

@@ -27,7 +27,7 @@ from ._gpu_field import Field, Shape
 from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, values_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
 
-BLOCK = 32  # points; with 64 all but the smallest kernels run out of registers (ptxas for compute capability 9.0)
+BLOCK = 32  # points; the way back already spills registers, and with 64 far more (ptxas, compute capability 9.0)
 RAY_ELEMENTS = 512  # padded samples that one program renders
 PROGRAMS_A_PROCESSOR = 2
 
