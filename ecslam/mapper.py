@@ -22,6 +22,7 @@ from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
 from .rays import DevicePixels, kernel_weights
+from .samples import seeded
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 
 MIN_BETA = 1.0
@@ -137,7 +138,7 @@ class Mapper:
     ) -> tuple[Tensor, Tensor]:
         """The same, ``CHUNK`` iterations (with moving poses all) in a graph; ``interrupt`` is called between them."""
         device, count = self.field.device, max(len(views), job.config.window.size)
-        generator = torch.Generator(device).manual_seed(int(self._rng.integers(2**62)))
+        generator = seeded(self._rng, device)
         still = np.arange(count) >= len(views)
         still[: len(views)] |= fixed
         poses, rates = torch.from_numpy(padded(c2w, count)).to(device), job.pose_rates(still).to(device)

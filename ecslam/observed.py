@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .pixels import Pixels
+
 BITS = 21
 HALF = 1 << (BITS - 1)
+LEAST_KNOWN = 100
 
 
 class ObservedVoxels:
@@ -30,3 +33,13 @@ class ObservedVoxels:
             return np.zeros(len(points), bool)
         keys = self._keys(points)
         return self.keys[np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)] == keys
+
+    def known(self, pixels: Pixels, guess: NDArray[np.float64], same_count: bool) -> Pixels:
+        """The pixels whose measured point, seen from ``guess`` [4, 4], lies in a marked voxel; all of them when that
+        leaves too few. same_count: as many as before, some of them more than once, so that a recorded loop fits."""
+        local = np.concatenate([pixels.direction, np.ones((len(pixels), 1), np.float32)], 1) * pixels.depth[:, None]
+        inside = self.contains(local @ guess[:3, :3].T + guess[:3, 3]) & (pixels.depth > 0)
+        index = np.flatnonzero(inside)
+        if len(index) < LEAST_KNOWN:
+            return pixels
+        return pixels.take(np.resize(index, len(pixels)) if same_count else index)

@@ -88,6 +88,11 @@ def resample_missing(
     return replace(rays, z=depths)
 
 
+def seeded(rng: np.random.Generator, device: torch.device) -> torch.Generator:
+    """Random numbers on ``device`` that depend on the state of ``rng`` alone, which a checkpoint can hold anywhere."""
+    return torch.Generator(device).manual_seed(int(rng.integers(2**62)))
+
+
 def uniform(generator: torch.Generator, device: torch.device, *shape: int) -> Tensor:
     """Random numbers in 0..1 on ``device``, drawn where the generator is."""
     return torch.rand(*shape, generator=generator, device=generator.device).to(device)

@@ -28,6 +28,7 @@ from .messages import LoopEvent, StepReport
 from .observed import ObservedVoxels
 from .pixels import Pixels, choose_pixels, spread_pixels
 from .recovery import Recovery, around, best_start, search
+from .samples import seeded
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .tracker import TrackResult, fit, track_adam, track_direct
 from .trajectory import Trajectory
@@ -64,6 +65,7 @@ class Slam:
         _require_tracking(config)
         self.config, self.intrinsics = config, intrinsics
         self.device = device or torch.device("cpu")
+        self._on_cpu = self.device.type == "cpu"
         self.kernels_name, self._kernels, self.kernels_note = seam.select(self.device)
         self._recorder = self._new_recorder()
         self.trajectory = Trajectory()
@@ -205,9 +207,10 @@ class Slam:
             c2w, losses = found.c2w, {"align_mm": 1e3 * found.cost**0.5}
         if config.tracking.iterations > 0:
             pixels = choose_pixels(frame, self.intrinsics, config.tracking.rays, config, self._rng)
-            pixels = self._known(pixels, c2w)
+            pixels = self._observed.known(pixels, c2w, same_count=not self._on_cpu)
+            generator = self._generator if self._on_cpu else seeded(self._rng, self.device)
             rendered, losses = track_adam(
-                self._require_field(), self._kernels, pixels, c2w, config, self._jitter(), self._recorder
+                self._require_field(), self._kernels, pixels, c2w, config, generator, self._recorder
             )
             agreed = WORSE * cost_at(surface, points, c2w, config)
             if config.align.to == "none" or cost_at(surface, points, rendered, config) <= agreed:
@@ -219,22 +222,6 @@ class Slam:
 
     def _learned(self) -> LearnedSurface:
         return LearnedSurface(self._require_field(), self._kernels, self.config.truncation_m, self._observed)
-
-    def _jitter(self) -> torch.Generator:
-        """Random numbers on the device. The state of a GPU's own generator would mean nothing to a checkpoint."""
-        if self.device.type == "cpu":
-            return self._generator
-        return torch.Generator(self.device).manual_seed(int(self._rng.integers(2**62)))
-
-    def _known(self, pixels: Pixels, guess: NDArray[np.float64]) -> Pixels:
-        """The pixels whose measured point, seen from ``guess``, lies where the map has been observed; all of them when
-        that leaves too few. On a GPU some of them twice, so that a recorded loop always finds the same number."""
-        local = np.concatenate([pixels.direction, np.ones((len(pixels), 1), np.float32)], 1) * pixels.depth[:, None]
-        known = self._observed.contains(local @ guess[:3, :3].T + guess[:3, 3]) & (pixels.depth > 0)
-        index = np.flatnonzero(known)
-        if self.device.type != "cpu":
-            index = np.resize(index, len(pixels))
-        return pixels.take(index) if known.sum() >= 100 else pixels
 
     def _fuse(self, frame: Frame) -> None:
         if self._volume is not None:
