@@ -79,7 +79,7 @@ class Slam:
         self._generator = torch.Generator().manual_seed(config.seed)
         self._observed = ObservedVoxels()
         lengths, fused = (config.align.voxel_m, config.truncation_m), config.align.to == "fused"
-        self._volume = create_volume(self.kernels_name, *lengths, self.device) if fused else None
+        self._volume = create_volume(self.kernels_name, *lengths, self.device, self._recorder) if fused else None
         self._loops, self._recovery = LoopDetector(), Recovery()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
         self._pending: Future[MapResult] | None = None

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .descent import Alignment, descend
 from .kernels import AlignSettings, NormalEquations, fusion
+from .kernels.graphs import Recorder
 from .pixels import Points
 from .types import Frame, Intrinsics
 
@@ -107,13 +108,16 @@ class FusedVolume:
         return descend(self, points, guess, settings, iterations)
 
 
-def create_volume(kernels: str, voxel_m: float, truncation_m: float, device: torch.device) -> FusedVolume | GpuVolume:
-    """An empty volume where the back end ``kernels`` computes: on ``device`` for ``gpu``, else on the CPU."""
+def create_volume(
+    kernels: str, voxel_m: float, truncation_m: float, device: torch.device, recorder: Recorder
+) -> FusedVolume | GpuVolume:
+    """An empty volume where the back end ``kernels`` computes: on ``device`` for ``gpu``, which records its alignments,
+    else on the CPU."""
     if kernels != "gpu":
         return FusedVolume(voxel_m, truncation_m)
     from .volume_gpu import GpuVolume
 
-    return GpuVolume(voxel_m, truncation_m, device)
+    return GpuVolume(voxel_m, truncation_m, device, recorder)
 
 
 @cache

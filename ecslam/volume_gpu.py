@@ -28,15 +28,19 @@ RULES = fusion_gpu.Rules(*DAMPING, SETTLED, *STILL, LEAST_USED)
 class GpuVolume:
     """See ``FusedVolume``; the same on a GPU, up to rounding."""
 
-    def __init__(self, voxel_m: float, truncation_m: float, device: torch.device) -> None:
+    def __init__(
+        self, voxel_m: float, truncation_m: float, device: torch.device, recorder: Recorder | None = None
+    ) -> None:
+        """recorder: of the alignments; used by no other thread."""
         self.voxel_m, self.truncation_m, self._device = voxel_m, truncation_m, device
+        self._record = recorder or Recorder()
         self._now = 0
         self._taken = torch.zeros(2, dtype=torch.int32, pin_memory=device.type == "cuda")
         self._allocate(SLOTS)
 
     def _allocate(self, slots: int) -> None:
         self._blocks, self._listed = fusion_gpu.allocate(slots, self.voxel_m, self.truncation_m, self._device)
-        self._record = Recorder()
+        self._record.forget()
 
     @property
     def used(self) -> int:

@@ -19,6 +19,7 @@ from ecslam.config import AlignConfig, Config
 from ecslam.descent import descend
 from ecslam.kernels import fusion_gpu
 from ecslam.kernels._gpu_descent import COST, COUNT, DAMPING, DONE, EQUATIONS, ROW, SIZE, step_kernel
+from ecslam.kernels.graphs import Recorder
 from ecslam.pixels import Points, spread_pixels
 from ecslam.types import Intrinsics
 from ecslam.volume import FusedVolume, create_volume
@@ -248,7 +249,7 @@ def test_growing_changes_nothing(monkeypatch, pair):
 
 
 def test_state_goes_round_through_both(pair):
-    theirs, mine = FusedVolume(*LENGTHS), create_volume("gpu", *LENGTHS, CPU)
+    theirs, mine = FusedVolume(*LENGTHS), create_volume("gpu", *LENGTHS, CPU, Recorder())
     theirs.load(pair[1].state())
     mine.load(pair[0].state())
     add(theirs, corners()[:1], POSES[2:])

@@ -70,6 +70,17 @@ def test_another_size_key_or_object_is_another_graph(change):
     assert (graphs.recorded, graphs.replayed) == (2, 2)
 
 
+def test_what_is_forgotten_is_recorded_again():
+    graphs = FakeGraphs()
+    recorder = Recorder(capture=graphs.capture)
+    for _ in range(2):
+        recorder(sum_and_difference, *pair(1.0), key=0)
+    recorder.forget()
+    for _ in range(2):
+        recorder(sum_and_difference, *pair(1.0), key=0)
+    assert (graphs.recorded, graphs.replayed) == (2, 2)
+
+
 def test_the_least_recently_used_graph_is_forgotten():
     graphs = FakeGraphs()
     recorder = Recorder(keep=2, capture=graphs.capture)

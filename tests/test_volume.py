@@ -11,6 +11,7 @@ from ecslam import se3, volume
 from ecslam.align import align, cost_at, known_points, stages
 from ecslam.config import Config
 from ecslam.descent import moved
+from ecslam.kernels.graphs import Recorder
 from ecslam.pixels import spread_pixels
 from ecslam.volume import FusedVolume, create_volume
 
@@ -132,7 +133,7 @@ def test_colour_holds_what_a_plain_wall_leaves_free():
 
 @pytest.mark.parametrize("kernels", ["reference", "cpu"])
 def test_without_gpu_kernels_the_volume_is_on_the_cpu(kernels):
-    assert isinstance(create_volume(kernels, 0.02, 0.06, torch.device("cuda")), FusedVolume)
+    assert isinstance(create_volume(kernels, 0.02, 0.06, torch.device("cuda"), Recorder()), FusedVolume)
 
 
 def test_moved_is_retract():

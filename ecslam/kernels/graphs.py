@@ -79,6 +79,10 @@ class Recorder:
         held.replay()
         return tuple(t.clone() for t in held.outputs)
 
+    def forget(self) -> None:
+        """Give up all graphs, and the memory that they hold."""
+        self._held.clear()
+
     def _remember(self, whole: Hashable, held: _Held) -> None:
         for oldest in list(self._held)[: max(0, len(self._held) + 1 - self._keep)]:
             del self._held[oldest]
