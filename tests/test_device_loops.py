@@ -54,6 +54,7 @@ def mapper(room, config, recorder=None):
     return Mapper(create_field(config.field, room.bounds, 0, CPU), kernels, 0, recorder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holes", [0.0, 0.3])
 def test_a_map_drawn_on_the_device_is_as_good_as_one_drawn_by_numpy(room, config, holes):
     views, poses = keyframes(room, config, holes)
@@ -68,6 +69,7 @@ def test_a_map_drawn_on_the_device_is_as_good_as_one_drawn_by_numpy(room, config
     assert losses[-1].sum() < 0.3 * losses[0].sum()
 
 
+@pytest.mark.slow
 def test_poses_move_on_the_device_as_they_do_on_the_host(room):
     config = apply_settings(load_preset("lite"), [*SETTINGS, "mapping.lr_rotation=1e-3", "mapping.lr_translation=1e-3"])
     views, poses = keyframes(room, config)
