@@ -13,6 +13,7 @@ import pytest
 from ecslam_app import server
 from ecslam_app.panel import TABS, BasePanel, find_panels
 from ecslam_app.panels.status import WORDS, render
+from ecslam_app.panels.status import Panel as Status
 
 from ecslam import config as configuration
 from ecslam import messages as m
@@ -74,8 +75,10 @@ def test_the_last_window_stays_on_the_page_between_two_mappings(engine, page):
 
 
 def test_a_halt_is_announced_until_it_has_come_about(engine, page):
-    status, moving = page.hub.panels[0], engine.skip_to(9).snapshot()
-    page.hub.current = moving = replace(moving, state=m.State.TRACKING)
+    engine.skip_to(9)
+    assert until(lambda: page.hub.current is engine.latest())
+    status = Status(page.hub)  # one that the page itself shows nothing on
+    page.hub.current = moving = replace(engine.snapshot(), state=m.State.TRACKING)
     status.ack(m.Ack(1, m.Pause()))
     assert "Pausing" in status._html.content
     status.snapshot(replace(moving, frame=10))

@@ -84,7 +84,7 @@ def test_poses_move_on_the_device_as_they_do_on_the_host(room):
         moved, _ = getattr(one, name)(job, views, off, fixed, 40, lambda: None)
         assert moved.shape == (3, 4, 4)
         assert np.array_equal(moved[:2].numpy(), poses[:2])
-        errors.append(float(np.linalg.norm(moved[2, :3, 3] - poses[2, :3, 3])))
+        errors.append(float(np.linalg.norm(moved[2, :3, 3].numpy() - poses[2, :3, 3])))
     assert max(errors) < 0.012
     assert errors[1] == pytest.approx(errors[0], abs=0.003)
 
