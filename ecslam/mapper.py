@@ -81,7 +81,7 @@ class Mapper:
         self._generator = torch.Generator().manual_seed(seed)
         self._gradients = map_params(field.params, torch.zeros_like)
         self._optimiser = FieldAdam(_tensors(field.params))
-        self._bank = PixelBank(field.device)
+        self._bank, self._spare = PixelBank(field.device), [torch.zeros(0)]
 
     def run(
         self,
@@ -99,11 +99,11 @@ class Mapper:
         Every iteration draws its rays from the stored pixels and transforms them by the current poses. smooth: with the
         smoothness term. settle: the map's learning rates fade to none, as those of the poses always do.
         """
-        before = [t.clone() for t in self._learnt()]
+        before = self._backup()
         job = Job(config, bool(not fixed.all()), smooth, settle)
         run = self._on_host if self.field.device.type == "cpu" else self._on_device
         moved, losses = run(job, views, c2w, fixed, iterations, interrupt or (lambda: None))
-        sound = torch.stack([torch.isfinite(t).all() for t in (*self._learnt(), moved)]).all()
+        sound = torch.stack([t.sum().double() for t in (*self._learnt(), moved)]).isfinite().all()
         told = torch.cat([moved.reshape(-1), losses[[0, -1]].reshape(-1).to(moved), sound[None].to(moved)]).cpu()
         if not told[-1]:
             for tensor, kept in zip(self._learnt(), before, strict=True):
@@ -204,6 +204,15 @@ class Mapper:
                 poses.step(result.d_c2w, share)
             losses.append(result.losses)
         return poses.c2w, torch.stack(losses or [torch.zeros(len(LOSS_NAMES), device=c2w.device)])
+
+    def _backup(self) -> list[Tensor]:
+        """Copies of all that is learnt, where those of the last run were."""
+        learnt = self._learnt()
+        if [t.shape for t in self._spare] != [t.shape for t in learnt]:
+            self._spare = [torch.empty_like(t) for t in learnt]
+        for spare, tensor in zip(self._spare, learnt, strict=True):
+            spare.copy_(tensor)
+        return self._spare
 
     def _learnt(self) -> list[Tensor]:
         adam = self._optimiser
