@@ -59,20 +59,24 @@ class DeviceDraw:
     """What the rays of a loop are drawn from, on one device.
 
     spans: int64 [W, 2], first row and count of each view in ``pixels``. row: int64 [R], the view of each ray. box: [2,
-    3] metres. missing: whether some pixels have no depth. jitter: [I, R, 1 + S], which pixel and where its samples lie;
-    with ``missing`` [I, R, 1 + S + near_depth], where those lie that follow the rendered depth.
+    3] metres. missing: whether some pixels have no depth.
     """
 
     pixels: DevicePixels
     spans: Tensor
     row: Tensor
     box: Tensor
-    jitter: Tensor
     missing: bool
 
-    def rays(self, iteration: int, c2w: Tensor, config: Config, field: TsdfField, kernels: Backend) -> RayBatch:
-        """The rays of an iteration with poses c2w [W, 4, 4], never waiting for the device."""
-        s, jitter = config.sampling, self.jitter[iteration]
+    def numbers(self, config: Config) -> int:
+        """How many random numbers a ray takes: which pixel, where its samples lie and, with ``missing``, where those
+        lie that follow the rendered depth."""
+        s = config.sampling
+        return 1 + s.uniform + (2 if self.missing else 1) * s.near_depth
+
+    def rays(self, jitter: Tensor, c2w: Tensor, config: Config, field: TsdfField, kernels: Backend) -> RayBatch:
+        """The rays of an iteration with poses c2w [W, 4, 4], never waiting for the device. jitter: [R, numbers]."""
+        s = config.sampling
         count = s.uniform + s.near_depth
         first, length = self.spans[self.row].unbind(1)
         at = first + torch.minimum((jitter[:, 0] * length).long(), length - 1)
@@ -88,26 +92,22 @@ def device_draw(
     bank: PixelBank,
     views: Sequence[Pixels],
     poses: int,
-    iterations: int,
     config: Config,
     box: Tensor,
-    generator: torch.Generator,
+    device: torch.device,
 ) -> DeviceDraw:
-    """Everything random of so many iterations at once. Sizes are always the same, so that a graph can be replayed:
-    exactly ``rays`` rays, and room for so many ``poses``."""
-    m, s, device = config.mapping, config.sampling, generator.device
+    """What to draw from these views. Sizes are always the same, so that a graph can be replayed: exactly ``rays`` rays,
+    and room for so many ``poses``."""
+    m = config.mapping
     spans = np.zeros((poses, 2), np.int64)
     spans[: len(views)] = bank.spans(views)
     row = np.repeat(np.arange(len(views)), shares(len(views), m.rays, m.newest_share))
-    missing = any(bool((view.depth <= 0).any()) for view in views)
-    numbers = 1 + s.uniform + (2 if missing else 1) * s.near_depth
     return DeviceDraw(
         bank.columns,
         torch.from_numpy(spans).to(device),
         torch.from_numpy(row[evenly(len(row), m.rays)]).to(device),
         box.to(device),
-        uniform(generator, device, iterations, m.rays, numbers),
-        missing,
+        any(bool((view.depth <= 0).any()) for view in views),
     )
 
 

@@ -22,7 +22,7 @@ from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
 from .rays import DevicePixels, kernel_weights
-from .samples import seeded
+from .samples import seeded, uniform
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 
 MIN_BETA = 1.0
@@ -101,8 +101,13 @@ class Mapper:
         """
         before = self._backup()
         job = Job(config, bool(not fixed.all()), smooth, settle)
-        run = self._on_host if self.field.device.type == "cpu" else self._on_device
-        moved, losses = run(job, views, c2w, fixed, iterations, interrupt or (lambda: None))
+        interrupt = interrupt or (lambda: None)
+        if self.field.device.type == "cpu":
+            draw = host_draw(views, config, self.field, self.kernels, self._rng, self._generator)
+            left = [1 - i / iterations for i in range(iterations)]
+            moved, losses = self._iterate(job, draw, torch.from_numpy(c2w), job.pose_rates(fixed), left, interrupt)
+        else:
+            moved, losses = self._on_device(job, views, c2w, fixed, iterations, interrupt)
         sound = torch.stack([t.sum().double() for t in (*self._learnt(), moved)]).isfinite().all()
         told = torch.cat([moved.reshape(-1), losses[[0, -1]].reshape(-1).to(moved), sound[None].to(moved)]).cpu()
         if not told[-1]:
@@ -113,20 +118,6 @@ class Mapper:
         poses = told[: c2w.size].view(c2w.shape).numpy()
         return MapResult(poses, dict(zip(LOSS_NAMES, last.tolist(), strict=True)), float(first.sum()))
 
-    def _on_host(
-        self,
-        job: Job,
-        views: Sequence[Pixels],
-        c2w: NDArray[np.float64],
-        fixed: NDArray[np.bool_],
-        iterations: int,
-        interrupt: Callable[[], None],
-    ) -> tuple[Tensor, Tensor]:
-        """The poses [W, 4, 4] and the loss terms [I, 5] of all iterations (of none: zeros [1, 5])."""
-        draw = host_draw(views, job.config, self.field, self.kernels, self._rng, self._generator)
-        left = [1 - i / iterations for i in range(iterations)]
-        return self._iterate(job, draw, torch.from_numpy(c2w), job.pose_rates(fixed), left, interrupt)
-
     def _on_device(
         self,
         job: Job,
@@ -136,19 +127,20 @@ class Mapper:
         iterations: int,
         interrupt: Callable[[], None],
     ) -> tuple[Tensor, Tensor]:
-        """The same, ``CHUNK`` iterations (with moving poses all) in a graph; ``interrupt`` is called between them."""
+        """The poses [W, 4, 4] and the loss terms [I, 5] of iterations, ``CHUNK`` (with moving poses all) in a graph;
+        ``interrupt`` is called between graphs."""
         device, count = self.field.device, max(len(views), job.config.window.size)
         generator = seeded(self._rng, device)
         still = np.arange(count) >= len(views)
         still[: len(views)] |= fixed
         poses, rates = torch.from_numpy(padded(c2w, count)).to(device), job.pose_rates(still).to(device)
         left = (1 - torch.arange(iterations) / max(iterations, 1)).to(device)
-        losses = []
+        chosen, losses = device_draw(self._bank, views, count, job.config, self.field.layout.box, device), []
+        recorder = Recorder(plain=True) if job.smooth else self.recorder
         for part_left in left.split(max(iterations, 1) if job.move else CHUNK):
             interrupt()
-            chosen = device_draw(self._bank, views, count, len(part_left), job.config, self.field.layout.box, generator)
-            inputs = (poses, rates, part_left, chosen.spans, chosen.row, chosen.box, chosen.jitter)
-            recorder = Recorder(plain=True) if job.smooth else self.recorder
+            jitter = uniform(generator, device, len(part_left), len(chosen.row), chosen.numbers(job.config))
+            inputs = (poses, rates, part_left, chosen.spans, chosen.row, chosen.box, jitter)
             poses, found = recorder(
                 partial(self._loop, job, chosen.pixels, chosen.missing),
                 *inputs,
@@ -171,11 +163,11 @@ class Mapper:
         box: Tensor,
         jitter: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Iterations as a function of tensors. left: [I]; for what follows see ``DeviceDraw``."""
-        chosen = DeviceDraw(pixels, spans, row, box, jitter, missing)
+        """Iterations as a function of tensors. left: [I]; jitter: [I, R, numbers]; the rest: see ``DeviceDraw``."""
+        chosen = DeviceDraw(pixels, spans, row, box, missing)
 
         def draw(iteration: int, poses: Tensor) -> RayBatch:
-            return chosen.rays(iteration, poses, job.config, self.field, self.kernels)
+            return chosen.rays(jitter[iteration], poses, job.config, self.field, self.kernels)
 
         return self._iterate(job, draw, c2w, rates, left.unbind(), lambda: None)
 

@@ -77,9 +77,9 @@ def rendered_depths(
 def resample_missing(
     rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, config: SamplingConfig, generator: torch.Generator
 ) -> RayBatch:
-    """Rays without depth get ``rendered_depths``. Waits for the device."""
+    """Rays without depth, of which there are some, get ``rendered_depths``. Waits for the device."""
     missing = torch.nonzero(rays.depth <= 0)[:, 0]
-    if len(missing) == 0 or config.uniform < LEAST_UNIFORM:
+    if config.uniform < LEAST_UNIFORM:
         return rays
     few = RayBatch(*(getattr(rays, f.name)[missing] for f in fields(RayBatch)))
     jitter = uniform(generator, rays.z.device, len(missing), rays.z.shape[1] - config.uniform)

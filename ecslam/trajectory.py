@@ -87,6 +87,6 @@ class Trajectory:
 
 def _with_room(rows: NDArray[Any], used: int) -> NDArray[Any]:
     """The same rows, with room for one more than the ``used`` ones: doubled when there is none."""
-    return (
-        rows if used < len(rows) else np.concatenate([rows, np.empty((max(used, ROOM), *rows.shape[1:]), rows.dtype)])
-    )
+    if used < len(rows):
+        return rows
+    return np.concatenate([rows, np.empty((max(used, ROOM), *rows.shape[1:]), rows.dtype)])

@@ -85,12 +85,27 @@ def add_products(sums, residual, gradient, lever, kernel, keep):
 
 
 @triton.jit
+def add_points(sums, value, gradient, light, d_light, seen, lever, settings, live, colour: tl.constexpr):
+    """Add points to ``sums`` float64 [67]: TSDF with its gradient per metre and, with ``colour``, luminance with
+    its own against the one that was ``seen``. settings: the fields of ``AlignSettings`` in their order."""
+    truncation, near, limit, low, high, scale, colour_kernel = settings
+    gx, gy, gz = gradient[0] * truncation, gradient[1] * truncation, gradient[2] * truncation
+    norm = tl.sqrt(gx * gx + gy * gy + gz * gz)
+    keep = live & (tl.abs(value) < limit) & (norm > low) & (norm < high)
+    share = add_products(sums, value * truncation, (gx, gy, gz), lever, near, keep)
+    tl.atomic_add(sums + 65, tl.sum(keep.to(tl.float64)), sem="relaxed")
+    tl.atomic_add(sums + 66, tl.sum((share * share > 0.5).to(tl.float64)), sem="relaxed")
+    if colour:
+        d_error = (d_light[0] * scale, d_light[1] * scale, d_light[2] * scale)
+        add_products(sums, (light - seen) * scale, d_error, lever, colour_kernel * scale, keep)
+
+
+@triton.jit
 def align_kernel(
     field, points, luminance, settings, sums, colour: tl.constexpr, shape: tl.constexpr, block: tl.constexpr
 ):
     """Add a block's share to ``sums`` float64 [67]. points.position: camera points; settings: the fields of
     ``AlignSettings`` in their order."""
-    truncation, near, limit, low, high, scale, colour_kernel = settings
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < points.total
     local = triple(points.position + 3 * i, live)
@@ -98,13 +113,4 @@ def align_kernel(
     tx, ty, tz = tl.load(points.c2w + 3), tl.load(points.c2w + 7), tl.load(points.c2w + 11)
     lever = (world[0] - tx.to(tl.float64), world[1] - ty.to(tl.float64), world[2] - tz.to(tl.float64))
     sdf, d_sdf, light, d_light = both_gradients(field, world, live, colour, shape)
-    gx, gy, gz = d_sdf[0] * truncation, d_sdf[1] * truncation, d_sdf[2] * truncation
-    norm = tl.sqrt(gx * gx + gy * gy + gz * gz)
-    keep = live & (tl.abs(sdf) < limit) & (norm > low) & (norm < high)
-    share = add_products(sums, sdf * truncation, (gx, gy, gz), lever, near, keep)
-    tl.atomic_add(sums + 65, tl.sum(keep.to(tl.float64)), sem="relaxed")
-    tl.atomic_add(sums + 66, tl.sum((share * share > 0.5).to(tl.float64)), sem="relaxed")
-    if colour:
-        error = (light - tl.load(luminance + i, live, 0.0)) * scale
-        d_error = (d_light[0] * scale, d_light[1] * scale, d_light[2] * scale)
-        add_products(sums, error, d_error, lever, colour_kernel * scale, keep)
+    add_points(sums, sdf, d_sdf, light, d_light, tl.load(luminance + i, live, 0.0), lever, settings, live, colour)

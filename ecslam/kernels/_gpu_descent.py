@@ -11,7 +11,7 @@ from typing import NamedTuple
 import triton
 import triton.language as tl
 
-from ._gpu_align import add_products
+from ._gpu_align import add_points
 from ._gpu_blocks import sample
 from ._gpu_points import moved, triple
 
@@ -39,7 +39,6 @@ def sums_kernel(
 ):  # fmt: skip
     """Add to ``sums`` (see ``_gpu_align``) those of every ``stride``-th of ``count`` points float32 [N, 4], camera
     coordinates and luminance, at a pose [3, 4]; nothing once ``done`` is set."""
-    truncation, near, limit, low, high, scale, colour_kernel = settings
     first = stride * block * tl.program_id(0)
     i = first + stride * tl.arange(0, block)
     total = tl.load(count).to(tl.int32)
@@ -50,17 +49,10 @@ def sums_kernel(
         lever = (world[0] - tl.load(pose + 3), world[1] - tl.load(pose + 7), world[2] - tl.load(pose + 11))
         (distance, gx, gy, gz), (light, lx, ly, lz), known = sample(blocks, world, live)
         per_metre = 1 / tl.load(blocks.lengths).to(tl.float32)
-        steep = truncation * per_metre
-        gx, gy, gz = gx * steep, gy * steep, gz * steep
-        norm = tl.sqrt(gx * gx + gy * gy + gz * gz)
-        keep = known & (tl.abs(distance) < limit) & (norm > low) & (norm < high)
-        share = add_products(sums, distance * truncation, (gx, gy, gz), lever, near, keep)
-        tl.atomic_add(sums + 65, tl.sum(keep.to(tl.float64)), sem="relaxed")
-        tl.atomic_add(sums + 66, tl.sum((share * share > 0.5).to(tl.float64)), sem="relaxed")
-        if colour:
-            error = (light - tl.load(points + 4 * i + 3, live, 0.0)) * scale
-            steep = scale * per_metre
-            add_products(sums, error, (lx * steep, ly * steep, lz * steep), lever, colour_kernel * scale, keep)
+        gradient = gx * per_metre, gy * per_metre, gz * per_metre
+        d_light = lx * per_metre, ly * per_metre, lz * per_metre
+        seen = tl.load(points + 4 * i + 3, live, 0.0)
+        add_points(sums, distance, gradient, light, d_light, seen, lever, settings, known, colour)
 
 
 @triton.jit
