@@ -14,10 +14,10 @@ from .pixels import Pixels, choose_pixels
 from .types import Frame, Intrinsics
 
 THUMBNAIL = (40, 30)
-BLOCK, ALIGNMENT = 4 << 20, 64  # bytes
+BLOCK, ALIGNMENT = 32 << 20, 64  # bytes; an untouched end of a block takes no memory, an unused one would
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Keyframe:
     """frame: index in the sequence. thumbnail: float32 [30 * 40], blurred luminance of zero mean and unit norm."""
 

@@ -79,7 +79,7 @@ class StepReport:
     note: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class KeyframeView:
     """A keyframe as the world sees it. c2w: float64 [4, 4]; picture: where a JPEG at most 160 px wide lies, if it could
     be saved."""

@@ -16,7 +16,7 @@ from .config import Config
 from .types import Corners, Frame, Intrinsics
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Pixels:
     """Chosen pixels of one frame, compact enough to keep: 20 bytes each.
 

@@ -98,7 +98,7 @@ class Slam:
         track = self._track(frame)
         index, lost = len(self.trajectory), self._recovery.lost
         keyframe = index % self.config.keyframe_every == 0 and not self._recovery.missed
-        self.trajectory.append(track.c2w, frame.timestamp, not self._recovery.missed, keyframe)
+        self.trajectory.append(track.c2w, frame.timestamp, keyframe)
         if not self._recovery.missed:
             self._fuse(frame)
         tracked = time.perf_counter()
@@ -134,7 +134,7 @@ class Slam:
         field = create_field(self.config.field, box, self.config.seed, self.device)
         self.mapper = Mapper(field, self._kernels, self.config.seed, self._new_recorder())
         self._frozen = field
-        self.trajectory.append(self._first_pose, frame.timestamp, True, keyframe=True)
+        self.trajectory.append(self._first_pose, frame.timestamp, keyframe=True)
         self.keyframes.append(self._shelf.keep(keyframe))
         self._window = np.array([0])
         try:

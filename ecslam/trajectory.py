@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,7 @@ class Trajectory:
     """Camera-to-world poses in metres, float64. Written by the engine thread alone."""
 
     def __init__(self) -> None:
-        self.timestamps: list[float] = []
-        self.tracked: list[bool] = []
+        self.timestamps = array("d")
         self._count = self._keyframe_count = 0
         self._keyframes, self._relative = np.empty((ROOM, 4, 4)), np.empty((ROOM, 4, 4))
         self._anchor = np.empty(ROOM, np.int64)
@@ -30,7 +30,7 @@ class Trajectory:
         index = range(self._count)[index]
         return np.asarray(self._keyframes[self._anchor[index]] @ self._relative[index])
 
-    def append(self, c2w: NDArray[np.float64], timestamp: float, tracked: bool, keyframe: bool) -> None:
+    def append(self, c2w: NDArray[np.float64], timestamp: float, keyframe: bool) -> None:
         """Add a frame. The first one must be a keyframe."""
         if keyframe:
             self._keyframes = _with_room(self._keyframes, self._keyframe_count)
@@ -42,7 +42,6 @@ class Trajectory:
         self._relative[self._count] = se3.orthonormalise(se3.inverse(self._keyframes[self._anchor[self._count]]) @ c2w)
         self._count += 1
         self.timestamps.append(timestamp)
-        self.tracked.append(tracked)
 
     def keyframe_poses(self) -> NDArray[np.float64]:
         """Poses [K, 4, 4] of the keyframes."""
@@ -66,8 +65,7 @@ class Trajectory:
     def state(self) -> dict[str, NDArray[np.generic]]:
         """Everything as arrays, for a checkpoint."""
         return {
-            "timestamps": np.asarray(self.timestamps, np.float64),
-            "tracked": np.asarray(self.tracked, np.uint8),
+            "timestamps": np.array(self.timestamps),
             "keyframes": self.keyframe_poses(),
             "anchor": self._anchor[: self._count].copy(),
             "relative": self._relative[: self._count].copy(),
@@ -77,8 +75,7 @@ class Trajectory:
     def restore(cls, state: dict[str, NDArray[np.generic]]) -> Trajectory:
         """The inverse of ``state``."""
         self = cls()
-        self.timestamps = [float(t) for t in state["timestamps"]]
-        self.tracked = [bool(t) for t in state["tracked"]]
+        self.timestamps = array("d", state["timestamps"])
         self._keyframes, self._relative = (np.array(state[name], np.float64) for name in ("keyframes", "relative"))
         self._anchor = np.array(state["anchor"], np.int64)
         self._count, self._keyframe_count = len(self._anchor), len(self._keyframes)

@@ -16,7 +16,7 @@ def moved(x):
 def build(count=12, every=5):
     t = Trajectory()
     for i in range(count):
-        t.append(moved(0.1 * i), i / 30, True, i % every == 0)
+        t.append(moved(0.1 * i), i / 30, i % every == 0)
     return t
 
 
@@ -45,8 +45,10 @@ def test_prediction_is_constant_velocity():
 
 def test_state_round_trip():
     t = build()
-    again = Trajectory.restore(t.state())
+    state = t.state()
+    again = Trajectory.restore(state)
     assert (again.poses() == t.poses()).all()
     assert again.timestamps == t.timestamps
-    again.append(moved(9), 1.0, False, False)
-    assert len(again) == len(t) + 1
+    for each in (t, again):
+        each.append(moved(9), 1.0, False)
+        assert len(each) == len(state["timestamps"]) + 1

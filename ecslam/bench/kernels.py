@@ -111,16 +111,21 @@ def _ways(name: str, job: Job, backends: dict[str, Backend], device: str) -> dic
 
 
 def _alternate(ways: dict[str, Callable[[], object]], repeats: int, device: str) -> dict[str, float]:
-    """Median milliseconds by way; every round goes each once, after two rounds that are not counted."""
+    """Median milliseconds by way; in each round each goes twice, and only the second time counts.
+
+    In the engine an iteration follows one like it, so it never finds the caches full of another back end's data.
+    The first round does not count either.
+    """
     spent: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(repeats + 2):
+    for _ in range(repeats + 1):
         for name, way in ways.items():
+            way()
             _wait(device)
             start = time.perf_counter()
             way()
             _wait(device)
             spent[name].append(1e3 * (time.perf_counter() - start))
-    return {name: statistics.median(times[2:]) for name, times in spent.items()}
+    return {name: statistics.median(times[1:]) for name, times in spent.items()}
 
 
 def _rates(device: torch.device, repeats: int) -> tuple[float, float]:

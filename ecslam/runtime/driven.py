@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,7 +25,10 @@ class Abandoned(Exception):
 class TrajectoryLike(Protocol):
     """The part of ``ecslam.trajectory.Trajectory`` that is read here."""
 
-    timestamps: list[float]
+    @property
+    def timestamps(self) -> Sequence[float]:
+        """Seconds, of all frames."""
+        ...
 
     def poses(self) -> NDArray[np.float64]:
         """Poses [n, 4, 4] of all frames."""
