@@ -114,40 +114,46 @@ def weights_back(grid, net, s, first, last, pitch, d_features, d_blob):
                 s.hidden, BOTH * first + v, BOTH, last - first,
             )  # fmt: skip
     for axis in range(3):
-        for v in range(0, BOTH, 16):
+        for v in range(0, BOTH, 32):
             blob_weights_back(s, first, last, pitch, axis, v, d_blob[axis * (grid.bins + 2) * BOTH :])
 
 
 @njit(**INNER)
 def blob_weights_back(s, first, last, pitch, axis, v, d_blob):
-    """Sixteen columns of ``weights_back`` for one axis: neighbours share their bins, so sums stay in registers."""
+    """Thirty-two columns of ``weights_back`` for one axis: neighbours share their bins, so sums stay in registers."""
     zero = splat(np.float32(0))
-    a0 = a1 = b0 = b1 = c0 = c1 = zero
+    none = (zero, zero, zero, zero, zero, zero)
+    left, right = none, none
     last_bin = s.bin[axis * pitch + first]
     for p in range(first, last):
         own = s.bin[axis * pitch + p]
         if own != last_bin:
-            add_sums(d_blob, BOTH * last_bin + v, a0, a1, b0, b1, c0, c1)
-            a0 = a1 = b0 = b1 = c0 = c1 = zero
+            add_sums(d_blob, BOTH * last_bin + v, left)
+            add_sums(d_blob, BOTH * last_bin + v + 16, right)
+            left, right = none, none
             last_bin = own
-        g0, g1 = load(s.hidden, BOTH * p + v), load(s.hidden, BOTH * p + v + 8)
         at = 3 * axis * pitch + p
         a, b, c = splat(s.coef[at]), splat(s.coef[at + pitch]), splat(s.coef[at + 2 * pitch])
-        a0, a1, b0, b1, c0, c1 = a0 + a * g0, a1 + a * g1, b0 + b * g0, b1 + b * g1, c0 + c * g0, c1 + c * g1
-    add_sums(d_blob, BOTH * last_bin + v, a0, a1, b0, b1, c0, c1)
+        left = grown(left, a, b, c, s.hidden, BOTH * p + v)
+        right = grown(right, a, b, c, s.hidden, BOTH * p + v + 16)
+    add_sums(d_blob, BOTH * last_bin + v, left)
+    add_sums(d_blob, BOTH * last_bin + v + 16, right)
 
 
 @njit(**INNER)
-def add_sums(target, at, a0, a1, b0, b1, c0, c1):
+def grown(sums, a, b, c, hidden, at):
+    """Sums of three rows of sixteen columns, with a, b and c times sixteen hidden gradients added."""
+    g, h = load(hidden, at), load(hidden, at + 8)
+    return sums[0] + a * g, sums[1] + a * h, sums[2] + b * g, sums[3] + b * h, sums[4] + c * g, sums[5] + c * h
+
+
+@njit(**INNER)
+def add_sums(target, at, sums):
     """Add sixteen columns of three rows, BOTH apart."""
-    store(target, at, load(target, at) + a0)
-    store(target, at + 8, load(target, at + 8) + a1)
-    at += BOTH
-    store(target, at, load(target, at) + b0)
-    store(target, at + 8, load(target, at + 8) + b1)
-    at += BOTH
-    store(target, at, load(target, at) + c0)
-    store(target, at + 8, load(target, at + 8) + c1)
+    for row in range(3):
+        for half in range(2):
+            place = at + row * BOTH + 8 * half
+            store(target, place, load(target, place) + sums[2 * row + half])
 
 
 @njit(**INNER)
