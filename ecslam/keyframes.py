@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -14,38 +13,66 @@ from .pixels import Pixels, choose_pixels
 from .types import Frame, Intrinsics
 
 THUMBNAIL = (40, 30)
-BLOCK, ALIGNMENT = 32 << 20, 64  # bytes; an untouched end of a block takes no memory, an unused one would
+THUMBNAIL_BYTES = 4 * THUMBNAIL[0] * THUMBNAIL[1]
+PIXEL_BYTES = 16
+BLOCK, ALIGNMENT = 32 << 20, 64  # bytes; the end of a block takes no memory before it is written to
 
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """frame: index in the sequence. thumbnail: float32 [30 * 40], blurred luminance of zero mean and unit norm."""
+    """One keyframe in one piece of memory, so that a thousand of them cost nothing but their pixels.
+
+    frame: index in the sequence. record: uint8 [bytes], the pixels' arrays and the thumbnail one after another.
+    """
 
     frame: int
-    pixels: Pixels
-    thumbnail: NDArray[np.float32]
+    record: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, frame: int, pixels: Pixels, thumbnail: NDArray[np.float32]) -> Keyframe:
+        """A keyframe with copies of these arrays."""
+        parts = (pixels.direction, pixels.depth, thumbnail, pixels.color, pixels.feature)
+        return cls(frame, np.concatenate([np.ascontiguousarray(part).reshape(-1).view(np.uint8) for part in parts]))
+
+    def __len__(self) -> int:
+        """How many pixels are stored."""
+        return (len(self.record) - THUMBNAIL_BYTES) // PIXEL_BYTES
+
+    @property
+    def pixels(self) -> Pixels:
+        """The stored pixels, views of ``record``."""
+        n, r = len(self), self.record
+        rest = 12 * n + THUMBNAIL_BYTES
+        return Pixels(
+            r[: 8 * n].view(np.float32).reshape(n, 2),
+            r[8 * n : 12 * n].view(np.float32),
+            r[rest : rest + 3 * n].reshape(n, 3),
+            r[rest + 3 * n :].view(np.bool_),
+        )
+
+    @property
+    def thumbnail(self) -> NDArray[np.float32]:
+        """float32 [30 * 40], blurred luminance of zero mean and unit norm."""
+        start = 12 * len(self)
+        return self.record[start : start + THUMBNAIL_BYTES].view(np.float32)
 
 
 class Shelf:
-    """Keeps the arrays of keyframes side by side in large blocks of memory: each for itself would lie among what the
-    engine needs for a moment, and pin the gaps."""
+    """Keeps keyframes side by side in large blocks of memory: each for itself would lie among what the engine needs for
+    a moment, and pin the gaps."""
 
     def __init__(self) -> None:
         self._free = np.empty(0, np.uint8)
 
     def keep(self, keyframe: Keyframe) -> Keyframe:
-        """The same keyframe, its arrays moved here."""
-        pixels = Pixels(*(self._put(getattr(keyframe.pixels, f.name)) for f in fields(Pixels)))
-        return Keyframe(keyframe.frame, pixels, self._put(keyframe.thumbnail))
-
-    def _put(self, array: NDArray[Any]) -> NDArray[Any]:
-        size = -(-array.nbytes // ALIGNMENT) * ALIGNMENT
+        """The same keyframe, moved here."""
+        count = len(keyframe.record)
+        size = -(-count // ALIGNMENT) * ALIGNMENT
         if size > len(self._free):
             self._free = np.empty(max(size, BLOCK), np.uint8)
-        kept = self._free[: array.nbytes].view(array.dtype).reshape(array.shape)
-        self._free = self._free[size:]
-        kept[...] = array
-        return kept
+        kept, self._free = self._free[:count], self._free[size:]
+        kept[:] = keyframe.record
+        return Keyframe(keyframe.frame, kept)
 
 
 def make_keyframe(frame: Frame, camera: Intrinsics, config: Config, rng: np.random.Generator) -> Keyframe:
@@ -54,7 +81,7 @@ def make_keyframe(frame: Frame, camera: Intrinsics, config: Config, rng: np.rand
     pixels = choose_pixels(frame, camera, count, config, rng, rim=config.mapping.rim)
     if not config.sampling.without_depth:
         pixels = pixels.take(np.flatnonzero(pixels.depth > 0))
-    return Keyframe(frame.index, pixels, make_thumbnail(frame.color))
+    return Keyframe.of(frame.index, pixels, make_thumbnail(frame.color))
 
 
 def make_thumbnail(color: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -31,14 +31,15 @@ class PixelBank:
         return np.array([[self._first_row(view), len(view)] for view in views], np.int64).reshape(-1, 2)
 
     def _first_row(self, view: Pixels) -> int:
-        if id(view) not in self._held:
+        place = view.depth.ctypes.data  # of memory that is held here, so nothing else comes to lie there
+        if place not in self._held:
             first, last = self._used, self._used + len(view)
             self._require(last)
             new = upload(view, self._device)
             for f in fields(DevicePixels):
                 getattr(self.columns, f.name)[first:last] = getattr(new, f.name)
-            self._held[id(view)], self._used = (view, first), last
-        return self._held[id(view)][1]
+            self._held[place], self._used = (view, first), last
+        return self._held[place][1]
 
     def _require(self, rows: int) -> None:
         if rows > len(self.columns.depth):

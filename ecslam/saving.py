@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from .field import TsdfField
 from .kernels import FieldParams, GridLayout
 from .keyframes import Keyframe
-from .pixels import Pixels
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -45,20 +44,13 @@ def unpack_field(arrays: Arrays, device: torch.device) -> TsdfField:
 
 
 def pack_keyframes(keyframes: list[Keyframe]) -> Arrays:
-    """Under ``FRAME.`` the arrays of each keyframe, not copied: they never change."""
-    out: Arrays = {}
-    for k in keyframes:
-        out[f"{k.frame}.thumbnail"] = k.thumbnail
-        out |= {f"{k.frame}.{f.name}": getattr(k.pixels, f.name) for f in fields(Pixels)}
-    return out
+    """The record of each keyframe under its frame, not copied: it never changes."""
+    return {str(k.frame): k.record for k in keyframes}
 
 
 def unpack_keyframes(arrays: Arrays) -> list[Keyframe]:
     """The inverse of ``pack_keyframes``, in the order of frames."""
-    return [
-        Keyframe(i, Pixels(*(arrays[f"{i}.{f.name}"] for f in fields(Pixels))), arrays[f"{i}.thumbnail"])
-        for i in sorted({int(name.partition(".")[0]) for name in arrays})
-    ]
+    return [Keyframe(frame, arrays[str(frame)]) for frame in sorted(map(int, arrays))]
 
 
 def pack_random(rng: np.random.Generator, generator: torch.Generator) -> Arrays:

@@ -320,8 +320,8 @@ class Slam:
         """Measured points [N, 3] of all keyframes in the world, where the map has been observed: about ``limit`` of
         them where there are more."""
         poses = self.trajectory.keyframe_poses()
-        stride = max(1, -(-sum(len(k.pixels) for k in self.keyframes) // limit))
-        thinned = [k.pixels.take(np.arange(0, len(k.pixels), stride)) for k in self.keyframes]
+        stride = max(1, -(-sum(map(len, self.keyframes)) // limit))
+        thinned = [k.pixels.take(np.arange(0, len(k), stride)) for k in self.keyframes]
         parts = [_world(pixels, pose) for pixels, pose in zip(thinned, poses, strict=True)]
         return np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
 

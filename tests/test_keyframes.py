@@ -28,10 +28,11 @@ def test_a_shelf_keeps_keyframes_as_they_are_side_by_side():
         for old, new in arrays:
             assert old.dtype == new.dtype
             np.testing.assert_array_equal(old, new)
-            assert new.base is not None
-            assert new.ctypes.data % 4 == 0
-    ends = [k.thumbnail.ctypes.data + k.thumbnail.nbytes for k in kept[:-1]]
-    starts = [k.pixels.direction.ctypes.data for k in kept[1:]]
+            assert np.shares_memory(new, after.record)
+            assert new.ctypes.data % new.itemsize == 0
+        assert len(after) == len(before.pixels)
+    ends = [k.record.ctypes.data + k.record.nbytes for k in kept[:-1]]
+    starts = [k.record.ctypes.data for k in kept[1:]]
     assert all(0 <= start - end < 64 for end, start in zip(ends, starts, strict=True))
 
 
@@ -39,6 +40,7 @@ def test_a_shelf_takes_what_is_larger_than_its_blocks_and_what_is_empty():
     shelf = Shelf()
     for count in (0, 2 << 20, 3):
         pixels = flat(count)
-        kept = shelf.keep(Keyframe(0, pixels, np.zeros(1200, np.float32)))
+        kept = shelf.keep(Keyframe.of(0, pixels, np.full(1200, 7, np.float32)))
         assert len(kept.pixels) == count
         assert kept.pixels.depth.sum() == count
+        assert (kept.thumbnail == 7).all()

@@ -90,9 +90,9 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
     frames_done; fps_wall (everything), fps_engine (tracking and mapping after the first frame), ate_rmse_cm;
     first_map_ms; track_ms and map_ms, means over the frames after the first; cost_ms, their sum for each frame, the
     first left out; peak_memory_mb, stored_keyframes_mb; memory_mb, resident memory at some of the frames, which are in
-    memory_frame. Growth from the mean over frames 200-400 to the mean over the last 200, None under 600 frames:
-    cost_growth (a ratio), memory_growth_mb (of resident memory), keyframe_growth_mb (what the keyframes stored in
-    between weigh) and other_growth_mb, the difference of the two. Raises InputError.
+    memory_frame. Growth from frames 200-400 to the last 200, None under 600 frames: cost_growth (a ratio of means),
+    memory_growth_mb (of the median resident memory: checkpoints come and go), keyframe_growth_mb (what the keyframes
+    stored in between weigh) and other_growth_mb, the difference of the two. Raises InputError.
     """
     memory: dict[int, float] = {}
     opened = open_sequence(sequence)
@@ -189,7 +189,7 @@ def _growth(
     if count < 3 * SPAN:
         return dict.fromkeys(("cost_growth", "memory_growth_mb", "keyframe_growth_mb", "other_growth_mb"))
     early, late = range(SPAN, 2 * SPAN), range(count - SPAN, count)
-    resident = [np.mean([mb for frame, mb in memory.items() if frame in span]) for span in (early, late)]
+    resident = [statistics.median([mb for frame, mb in memory.items() if frame in span]) for span in (early, late)]
     grown_mb = float(resident[1] - resident[0])
     between_mb = float(stored_mb * ((keyframes >= 1.5 * SPAN) & (keyframes < count - SPAN / 2)).mean())
     return {
