@@ -18,7 +18,7 @@ from .types import Corners, Frame, Intrinsics
 
 @dataclass(frozen=True, slots=True)
 class Pixels:
-    """Chosen pixels of one frame, compact enough to keep: 20 bytes each.
+    """Chosen pixels of one frame, compact enough to keep: 16 bytes each.
 
     direction: float32 [N, 2], the x and y of the viewing ray at unit depth. depth: float32 [N] metres, 0 = none.
     color: uint8 [N, 3]. feature: bool [N].
