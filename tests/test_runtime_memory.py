@@ -9,8 +9,8 @@ from ecslam.runtime.memory import peak_memory_mb, resident_mb
 
 HOLES = """
 import numpy as np
-from ecslam.runtime.memory import resident_mb, return_large_blocks
-return_large_blocks()
+from ecslam.runtime.memory import resident_mb, keep_no_holes
+keep_no_holes()
 np.ones(30 << 20, np.uint8)
 before = resident_mb()
 blocks, small = [], []
@@ -29,6 +29,35 @@ def test_holes_go_back_to_the_system():
     held, left = map(float, subprocess.run(program, capture_output=True, text=True, check=True).stdout.split())
     assert held > 120
     assert left < 20
+
+
+SHARED = """
+import threading
+import numpy as np
+from ecslam.runtime.memory import keep_no_holes, resident_mb
+keep_no_holes()
+kept, before, together = [], resident_mb(), threading.Barrier(16)
+lock = threading.Lock()
+def work():
+    together.wait()
+    with lock:
+        large = np.ones(1 << 20, np.uint8)
+        kept.append(np.ones(1 << 10, np.uint8))
+        del large
+    together.wait()
+threads = [threading.Thread(target=work) for _ in range(16)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(resident_mb() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems return memory by their own rules")
+def test_a_thread_reuses_what_another_has_freed():
+    program = [sys.executable, "-c", SHARED]
+    assert float(subprocess.run(program, capture_output=True, text=True, check=True).stdout) < 6
 
 
 GAPS = """

@@ -25,7 +25,7 @@ from .checkpoint import Checkpoint, load_checkpoint
 from .control import Control, Turn
 from .driven import Abandoned, SlamFactory, make_slam
 from .feed import Feed, FeedSubscription
-from .memory import return_large_blocks
+from .memory import keep_no_holes
 from .run import Plan, Run
 from .runfolder import RunFolder
 from .snapshots import state_of, take_snapshot
@@ -63,7 +63,7 @@ class Engine:
         make: SlamFactory = make_slam,
         resumed: Checkpoint | None = None,
     ) -> None:
-        return_large_blocks()
+        keep_no_holes()
         address = sequence if isinstance(sequence, str) else sequence.name
         opened = open_sequence(sequence) if isinstance(sequence, str) else sequence
         plan = Plan(config, datasets.select_frames(opened, frames), address, frames, device, out)

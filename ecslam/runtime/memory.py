@@ -7,7 +7,7 @@ import resource
 import sys
 from pathlib import Path
 
-M_MMAP_THRESHOLD = -3
+M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
 LARGE = 2 << 20
 
 
@@ -25,13 +25,15 @@ def resident_mb() -> float:
         return peak_memory_mb()
 
 
-def return_large_blocks() -> None:
-    """From now on give every freed block of ``LARGE`` bytes or more back to the system at once.
+def keep_no_holes() -> None:
+    """From now on give every freed block of ``LARGE`` bytes or more back to the system at once, and let threads that
+    start later share one heap, where each reuses what another has freed.
 
     glibc raises this limit to 32 MB by itself, and then keeps the holes that meshes and checkpoints leave: 100 MB of
     them in a run of the studio. Concerns the whole process; does nothing on other systems.
     """
     _glibc("mallopt", M_MMAP_THRESHOLD, LARGE)
+    _glibc("mallopt", M_ARENA_MAX, 1)
 
 
 def return_holes() -> None:
