@@ -11,15 +11,15 @@ from ._cpu_simd import (
     isplat,
     lanes,
     load,
-    make_tile,
     same_bits,
-    scatter_add,
     slide,
     splat,
     store,
     transpose,
     where_positive,
 )
+from ._cpu_table import scatter_add
+from ._cpu_tile import make_tile
 
 tile_set = make_tile(4, 2, False, False)
 tile_add = make_tile(4, 2, True, False)

@@ -12,7 +12,9 @@ import numpy as np
 from numba import njit
 
 from ._cpu_math import BOTH, HALF, INNER, dots, sigmoid
-from ._cpu_simd import floor, fma, gather, highest, isplat, load, lowest, make_tile, splat, store, to_int
+from ._cpu_simd import floor, fma, highest, isplat, load, lowest, splat, store, to_int
+from ._cpu_table import gather
+from ._cpu_tile import make_tile
 
 BLOCK = 32  # points whose hidden units stay in the first-level cache through all passes
 P1, P2 = -1640531535, 805459861

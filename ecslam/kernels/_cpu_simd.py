@@ -69,17 +69,17 @@ _operator(operator.xor, i32x8, lambda b, x, y: b.xor(x, y))
 _operator(operator.and_, i32x8, lambda b, x, y: b.and_(x, y))
 
 
-def _splat(builder, value, kind):
+def emit_splat(builder, value, kind):
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, INT(0))
     return builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(INTS, [0] * LANES))
 
 
-def _pointer(context, builder, kind, array, index, element):
+def emit_pointer(context, builder, kind, array, index, element):
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), element.as_pointer())
 
 
-def _call(builder, name, *args):
+def emit_call(builder, name, *args):
     kind = ir.FunctionType(FLOATS, [FLOATS] * len(args))
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{LANES}f32"), args)
 
@@ -89,7 +89,7 @@ def splat(typing, value):
     """The float ``value`` in every lane."""
 
     def generate(context, builder, signature, args):
-        return _splat(builder, context.cast(builder, args[0], value, types.float32), FLOATS)
+        return emit_splat(builder, context.cast(builder, args[0], value, types.float32), FLOATS)
 
     return f32x8(value), generate
 
@@ -99,7 +99,7 @@ def isplat(typing, value):
     """The integer ``value`` in every lane."""
 
     def generate(context, builder, signature, args):
-        return _splat(builder, context.cast(builder, args[0], value, types.int32), INTS)
+        return emit_splat(builder, context.cast(builder, args[0], value, types.int32), INTS)
 
     return i32x8(value), generate
 
@@ -112,7 +112,7 @@ def load(typing, array, index):
     def generate(context, builder, signature, args):
         index = context.cast(builder, args[1], signature.args[1], types.intp)
         element = FLOATS if kind == f32x8 else INTS
-        return builder.load(_pointer(context, builder, array, args[0], index, element), align=4)
+        return builder.load(emit_pointer(context, builder, array, args[0], index, element), align=4)
 
     return kind(array, index), generate
 
@@ -123,7 +123,7 @@ def store(typing, array, index, value):
 
     def generate(context, builder, signature, args):
         index = context.cast(builder, args[1], signature.args[1], types.intp)
-        builder.store(args[2], _pointer(context, builder, array, args[0], index, args[2].type), align=4)
+        builder.store(args[2], emit_pointer(context, builder, array, args[0], index, args[2].type), align=4)
         return context.get_dummy_value()
 
     return types.void(array, index, value), generate
@@ -132,13 +132,13 @@ def store(typing, array, index, value):
 @intrinsic
 def fma(typing, a, b, c):
     """a * b + c, never reordered (fused wherever the machine can)."""
-    return f32x8(a, b, c), lambda context, builder, signature, args: _call(builder, "llvm.fmuladd", *args)
+    return f32x8(a, b, c), lambda context, builder, signature, args: emit_call(builder, "llvm.fmuladd", *args)
 
 
 @intrinsic
 def floor(typing, a):
     """Largest whole number not above each lane."""
-    return f32x8(a), lambda context, builder, signature, args: _call(builder, "llvm.floor", *args)
+    return f32x8(a), lambda context, builder, signature, args: emit_call(builder, "llvm.floor", *args)
 
 
 @intrinsic
@@ -194,7 +194,7 @@ def power_of_two(typing, a):
     return f32x8(a), generate
 
 
-def _shuffle(builder, a, b, lanes):
+def emit_shuffle(builder, a, b, lanes):
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(lanes)), list(lanes)))
 
 
@@ -214,7 +214,7 @@ def row_sums(typing, a, b, c, d, e, f, g, h):
         rows = list(args)
         for even, odd, _ in STAGES:
             pairs = zip(rows[::2], rows[1::2], strict=True)
-            rows = [builder.fadd(_shuffle(builder, x, y, even), _shuffle(builder, x, y, odd)) for x, y in pairs]
+            rows = [builder.fadd(emit_shuffle(builder, x, y, even), emit_shuffle(builder, x, y, odd)) for x, y in pairs]
         return rows[0]
 
     return f32x8(a, b, c, d, e, f, g, h), generate
@@ -232,14 +232,14 @@ def transpose(typing, source, at, stride, target, to, pitch):
 
         def place(kind, array, start, step, i):
             index = builder.add(start, builder.mul(step, ir.Constant(step.type, i)))
-            return _pointer(context, builder, kind, array, index, element)
+            return emit_pointer(context, builder, kind, array, index, element)
 
         rows = [builder.load(place(source, args[0], at, stride, i), align=4) for i in range(LANES)]
         for even, odd, step in STAGES:
             new = list(rows)
             for i in (i for i in range(LANES) if not i & step):
-                new[i] = _shuffle(builder, rows[i], rows[i + step], even)
-                new[i + step] = _shuffle(builder, rows[i], rows[i + step], odd)
+                new[i] = emit_shuffle(builder, rows[i], rows[i + step], even)
+                new[i + step] = emit_shuffle(builder, rows[i], rows[i + step], odd)
             rows = new
         for i in range(LANES):
             builder.store(rows[i], place(target, args[3], to, pitch, i), align=4)
@@ -248,65 +248,11 @@ def transpose(typing, source, at, stride, target, to, pitch):
     return types.void(source, at, stride, target, to, pitch), generate
 
 
-PAIR = ir.VectorType(FLOAT, 2)
-
-
-def _row(context, builder, kind, table, index):
-    """Pointer to a table row of two floats."""
-    data = context.make_array(kind)(context, builder, table).data
-    return builder.gep(builder.bitcast(data, PAIR.as_pointer()), [builder.sext(index, ir.IntType(64))])
-
-
-@intrinsic
-def gather(typing, table, rows, start):
-    """Both floats of the rows ``rows[start : start + 8]`` of a flat table of rows of two.
-
-    The row numbers come from memory, one load each: cheaper than taking a vector apart, which LLVM would rather do
-    when it sees them being stored, hence the (free) monotonic loads.
-    """
-
-    def generate(context, builder, signature, args):
-        start = context.cast(builder, args[2], signature.args[2], types.intp)
-        pairs = []
-        for i in range(LANES):
-            at = builder.add(start, ir.Constant(start.type, i))
-            index = builder.load_atomic(_pointer(context, builder, rows, args[1], at, INT), "monotonic", 4)
-            pairs.append(builder.load(_row(context, builder, table, args[0], index), align=4))
-
-        def join(order):
-            left, right = (_shuffle(builder, pairs[a], pairs[b], range(4)) for a, b in (order[:2], order[2:]))
-            return _shuffle(builder, left, right, range(8))
-
-        low, high = join((0, 1, 4, 5)), join((2, 3, 6, 7))
-        first = _shuffle(builder, low, high, [0, 2, 8, 10, 4, 6, 12, 14])
-        second = _shuffle(builder, low, high, [1, 3, 9, 11, 5, 7, 13, 15])
-        return context.make_tuple(builder, signature.return_type, [first, second])
-
-    return types.UniTuple(f32x8, 2)(table, rows, start), generate
-
-
-@intrinsic
-def scatter_add(typing, table, rows, start, a, b):
-    """Add a and b to the two floats of the rows ``rows[start : start + 8]`` of a flat table."""
-
-    def generate(context, builder, signature, args):
-        start = context.cast(builder, args[2], signature.args[2], types.intp)
-        for i in range(LANES):
-            at = builder.add(start, ir.Constant(start.type, i))
-            index = builder.load(_pointer(context, builder, rows, args[1], at, INT), align=4)
-            pointer = _row(context, builder, table, args[0], index)
-            term = _shuffle(builder, args[3], args[4], [i, LANES + i])
-            builder.store(builder.fadd(builder.load(pointer, align=4), term), pointer, align=4)
-        return context.get_dummy_value()
-
-    return types.void(table, rows, start, a, b), generate
-
-
 @intrinsic
 def slide(typing, before, a):
     """The last lane of ``before``, then the first seven of a."""
     lanes = range(LANES - 1, 2 * LANES - 1)
-    return a(before, a), lambda context, builder, signature, args: _shuffle(builder, args[0], args[1], lanes)
+    return a(before, a), lambda context, builder, signature, args: emit_shuffle(builder, args[0], args[1], lanes)
 
 
 @intrinsic
@@ -340,63 +286,7 @@ def fetch_add(typing, array, index):
 
     def generate(context, builder, signature, args):
         index = context.cast(builder, args[1], signature.args[1], types.intp)
-        pointer = _pointer(context, builder, array, args[0], index, ir.IntType(64))
+        pointer = emit_pointer(context, builder, array, args[0], index, ir.IntType(64))
         return builder.atomic_rmw("add", pointer, ir.IntType(64)(1), "monotonic")
 
     return types.int64(array, index), generate
-
-
-def make_tile(rows, columns, accumulate, relu):
-    """A register tile of a matrix product: C[rows, 8 columns] (+)= A[rows, n] @ B[n, 8 columns], perhaps clipped at 0.
-
-    The jitted function takes (C, start, row stride, A, start, row stride, term stride, B, start, row stride, n), all
-    arrays flat float32. One such tile serves the forward pass and both backward passes of the first layer.
-    """
-
-    @intrinsic
-    def tile(typing, c, c0, cr, a, a0, ar, ak, b, b0, bk, n):
-        def generate(context, builder, signature, args):
-            numbers = [context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 2, 4, 5, 6, 8, 9, 10)]
-            c0, cr, a0, ar, ak, b0, bk, n = numbers
-
-            def at(kind, array, element, *terms):
-                index = terms[0]
-                for step, count in zip(terms[1::2], terms[2::2], strict=True):
-                    factor = count if isinstance(count, ir.Value) else ir.Constant(step.type, count)
-                    index = builder.add(index, builder.mul(step, factor))
-                return _pointer(context, builder, kind, array, index, element)
-
-            places = [
-                at(c, args[0], FLOATS, builder.add(c0, ir.Constant(n.type, LANES * j)), cr, i)
-                for i in range(rows)
-                for j in range(columns)
-            ]
-            sums = [cgutils.alloca_once(builder, FLOATS) for _ in places]
-            for place, total in zip(places, sums, strict=True):
-                start = builder.load(place, align=4) if accumulate else ir.Constant(FLOATS, [0.0] * LANES)
-                builder.store(start, total)
-            with cgutils.for_range(builder, n) as loop:
-                k = loop.index
-                right = [
-                    builder.load(
-                        at(b, args[7], FLOATS, builder.add(b0, ir.Constant(n.type, LANES * j)), bk, k), align=4
-                    )
-                    for j in range(columns)
-                ]
-                for i in range(rows):
-                    value = builder.load(at(a, args[3], FLOAT, a0, ar, i, ak, k))
-                    left = _splat(builder, value, FLOATS)
-                    for j in range(columns):
-                        total = sums[i * columns + j]
-                        builder.store(_call(builder, "llvm.fmuladd", left, right[j], builder.load(total)), total)
-            zero = ir.Constant(FLOATS, [0.0] * LANES)
-            for place, total in zip(places, sums, strict=True):
-                value = builder.load(total)
-                if relu:
-                    value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
-                builder.store(value, place, align=4)
-            return context.get_dummy_value()
-
-        return types.void(c, c0, cr, a, a0, ar, ak, b, b0, bk, n), generate
-
-    return tile
