@@ -22,7 +22,7 @@ BLOCK, ALIGNMENT = 32 << 20, 64  # bytes; the end of a block takes no memory bef
 class Keyframe:
     """One keyframe in one piece of memory, so that a thousand of them cost nothing but their pixels.
 
-    frame: index in the sequence. record: uint8 [bytes], the pixels' arrays and the thumbnail one after another.
+    frame: index in the sequence. record: uint8 [bytes], the thumbnail and then the arrays of the pixels.
     """
 
     frame: int
@@ -31,8 +31,8 @@ class Keyframe:
     @classmethod
     def of(cls, frame: int, pixels: Pixels, thumbnail: NDArray[np.float32]) -> Keyframe:
         """A keyframe with copies of these arrays."""
-        parts = (pixels.direction, pixels.depth, thumbnail, pixels.color, pixels.feature)
-        return cls(frame, np.concatenate([np.ascontiguousarray(part).reshape(-1).view(np.uint8) for part in parts]))
+        parts = (thumbnail, pixels.direction, pixels.depth, pixels.color, pixels.feature)
+        return cls(frame, np.concatenate([part.ravel().view(np.uint8) for part in parts]))
 
     def __len__(self) -> int:
         """How many pixels are stored."""
@@ -41,20 +41,19 @@ class Keyframe:
     @property
     def pixels(self) -> Pixels:
         """The stored pixels, views of ``record``."""
-        n, r = len(self), self.record
-        rest = 12 * n + THUMBNAIL_BYTES
+        n = len(self)
+        direction, depth, color, feature = np.split(self.record[THUMBNAIL_BYTES:], [8 * n, 12 * n, 15 * n])
         return Pixels(
-            r[: 8 * n].view(np.float32).reshape(n, 2),
-            r[8 * n : 12 * n].view(np.float32),
-            r[rest : rest + 3 * n].reshape(n, 3),
-            r[rest + 3 * n :].view(np.bool_),
+            direction.view(np.float32).reshape(n, 2),
+            depth.view(np.float32),
+            color.reshape(n, 3),
+            feature.view(np.bool_),
         )
 
     @property
     def thumbnail(self) -> NDArray[np.float32]:
         """float32 [30 * 40], blurred luminance of zero mean and unit norm."""
-        start = 12 * len(self)
-        return self.record[start : start + THUMBNAIL_BYTES].view(np.float32)
+        return self.record[:THUMBNAIL_BYTES].view(np.float32)
 
 
 class Shelf:
