@@ -1,8 +1,8 @@
 """Rigid motions as 4x4 camera-to-world matrices and their tangent vectors.
 
 A tangent vector xi = (v, w) is [..., 6]: translation v in metres first, then rotation w in radians (axis times angle).
-Updates are applied from the left in the world frame around the camera's own centre: the rotation turns the camera
-about its optical centre and v moves the centre, so the two parts do not mix (what the paper's optimisers see).
+Updates are applied from the left, in the axes of the world: the rotation turns the camera about its optical centre, or
+about a point that it looks at, and v then moves it.
 """
 
 from __future__ import annotations
@@ -65,18 +65,25 @@ def so3_log(rotation: Tensor) -> Tensor:
     return torch.where(near_pi[..., None], angle[..., None] * axis, scale[..., None] * vee)
 
 
-def retract(c2w: Tensor, xi: Tensor) -> Tensor:
-    """Move poses [..., 4, 4] by tangent vectors [..., 6]: R <- exp(w) R, t <- t + v."""
+def retract(c2w: Tensor, xi: Tensor, about: Tensor | None = None) -> Tensor:
+    """Move poses [..., 4, 4] by tangent vectors [..., 6]: R <- exp(w) R, t <- t + v.
+
+    about: [..., 3], in camera coordinates, the points that the rotations leave where they are; without: the camera.
+    """
     rotation = so3_exp(xi[..., 3:]) @ c2w[..., :3, :3]
     translation = c2w[..., :3, 3] + xi[..., :3]
+    if about is not None:
+        translation = translation + ((c2w[..., :3, :3] - rotation) @ about[..., None])[..., 0]
     top = torch.cat([rotation, translation[..., None]], -1)
     bottom = c2w[..., 3:, :].expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], -2)
 
 
-def tangent_gradient(c2w: Tensor, gradient: Tensor) -> Tensor:
+def tangent_gradient(c2w: Tensor, gradient: Tensor, about: Tensor | None = None) -> Tensor:
     """Gradient [..., 6] in the tangent of ``retract`` at zero, from one [..., 3, 4] with respect to c2w[:3, :4]."""
-    rotation, g = c2w[..., :3, :3], gradient[..., :3, :3]
+    rotation, g, v = c2w[..., :3, :3], gradient[..., :3, :3], gradient[..., :3, 3]
     m = g @ rotation.transpose(-1, -2)
     w = torch.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1)
-    return torch.cat([gradient[..., :3, 3], w], -1)
+    if about is not None:
+        w = w - torch.linalg.cross((rotation @ about[..., None])[..., 0], v)
+    return torch.cat([v, w], -1)

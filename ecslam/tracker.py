@@ -17,7 +17,7 @@ from .kernels import LOSS_NAMES, Backend, RayBatch, Weights
 from .kernels.graphs import Recorder
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
-from .rays import kernel_weights, make_rays, upload
+from .rays import kernel_weights, make_rays, upload, view_centres
 from .samples import resample_missing, uniform
 
 LEAST_SEEN = 0.1
@@ -53,26 +53,34 @@ def track_adam(
         rays = resample_missing(rays, c2w.float(), field, kernels, s, generator)
     rates = pose_rates(torch.zeros(1, dtype=torch.bool), t.lr_rotation, t.lr_translation).to(device)
     weights = kernel_weights(t.loss, config)
-    loop = partial(_descend, field, kernels, weights, t.iterations)
+    loop = partial(_descend, field, kernels, weights, t.iterations, t.momentum)
     tensors = (getattr(rays, f.name) for f in fields(RayBatch))
-    best, terms = recorder(loop, c2w, rates, *tensors, key=(weights, t.iterations), over=(field,))
+    best, terms = recorder(loop, c2w, rates, *tensors, key=(weights, t.iterations, t.momentum), over=(field,))
     return best[0].cpu().numpy(), dict(zip(LOSS_NAMES, terms.tolist(), strict=True))
 
 
 def _descend(
-    field: TsdfField, kernels: Backend, weights: Weights, iterations: int, c2w: Tensor, rates: Tensor, *rays: Tensor
+    field: TsdfField,
+    kernels: Backend,
+    weights: Weights,
+    iterations: int,
+    momentum: float,
+    c2w: Tensor,
+    rates: Tensor,
+    *rays: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The iterations, never waiting for the device: the best iterate [1, 4, 4] and the terms [5] there."""
-    optimiser, best = PoseAdam(c2w, rates), c2w
+    optimiser, best, batch = PoseAdam(c2w, rates, momentum), c2w, RayBatch(*rays)
+    centre = view_centres(batch, 1)
     best_terms = torch.full((len(LOSS_NAMES),), torch.inf, device=c2w.device)
     for _ in range(iterations):
         pose = optimiser.c2w.float()
-        result = kernels.step(field.layout, field.params, pose, RayBatch(*rays), weights, None, True)
+        result = kernels.step(field.layout, field.params, pose, batch, weights, None, True)
         better = result.losses.sum() < best_terms.sum()
         best = torch.where(better, optimiser.c2w, best)
         best_terms = torch.where(better, result.losses, best_terms)
         assert result.d_c2w is not None
-        optimiser.step(result.d_c2w)
+        optimiser.step(result.d_c2w, centre)
     return best, best_terms
 
 

@@ -194,7 +194,7 @@ def test_no_iteration_of_tracking_waits_for_the_gpu(gpu):
     rays += [torch.empty(30, dtype=dtype, device=gpu) for dtype in (torch.bool, torch.int64)]
     field = SimpleNamespace(layout=None, params=None)
     with Forbidding():
-        best, terms = _descend(field, NoKernels, None, 3, c2w, rates, *rays)
+        best, terms = _descend(field, NoKernels, None, 3, 0.5, c2w, rates, *rays)
     assert (best.shape, terms.shape) == ((1, 4, 4), (5,))
 
 

@@ -47,9 +47,10 @@ def test_tangent_gradient_is_the_derivative_of_retract(start, probe):
     """Oracle: autograd through ``retract`` at zero."""
     c2w = pose(start)
     upstream = torch.outer(probe[:3], torch.cat([probe[2:5], torch.ones(1, dtype=torch.float64)]))
-    xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    (se3.retract(c2w, xi)[:3] * upstream).sum().backward()
-    assert torch.allclose(se3.tangent_gradient(c2w, upstream), xi.grad, atol=1e-9)
+    for about in (None, probe[3:]):
+        xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        (se3.retract(c2w, xi, about)[:3] * upstream).sum().backward()
+        assert torch.allclose(se3.tangent_gradient(c2w, upstream, about), xi.grad, atol=1e-9)
 
 
 @given(vectors, st.floats(0, 170))
@@ -68,3 +69,12 @@ def test_orthonormalise_is_identity_on_rigid_motions_and_repairs_others(xi):
     bent = t.copy()
     bent[:3, :3] *= 1.001
     assert np.allclose(se3.orthonormalise(bent), t, atol=1e-9)
+
+
+@given(vectors, vectors)
+@settings(max_examples=25)
+def test_a_turn_about_a_point_leaves_it_where_it_is(start, probe):
+    c2w, about = pose(start), probe[:3]
+    turned = se3.retract(c2w, torch.cat([torch.zeros(3, dtype=torch.float64), probe[3:]]), about)
+    assert torch.allclose(turned[:3, :3] @ about + turned[:3, 3], c2w[:3, :3] @ about + c2w[:3, 3], atol=1e-9)
+    assert torch.allclose(turned[:3, :3], pose(torch.cat([start[:3], probe[3:]]))[:3, :3] @ c2w[:3, :3], atol=1e-9)
