@@ -21,7 +21,7 @@ from .losses import smooth_lattice, smoothness
 from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
-from .rays import DevicePixels, kernel_weights, view_centres
+from .rays import DevicePixels, kernel_weights
 from .samples import seeded, uniform
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 
@@ -193,7 +193,7 @@ class Mapper:
             self._optimiser.step(_tensors(self._gradients), job.map_rates(share))
             field.params.beta.clamp_(min=MIN_BETA)
             if result.d_c2w is not None:
-                poses.step(result.d_c2w, view_centres(rays, len(now)), share)
+                poses.step(result.d_c2w, share)
             losses.append(result.losses)
         return poses.c2w, torch.stack(losses or [torch.zeros(len(LOSS_NAMES), device=c2w.device)])
 

@@ -17,26 +17,25 @@ def pose_rates(fixed: Tensor, lr_rotation: float, lr_translation: float) -> Tens
 
 
 class PoseAdam:
-    """Optimises poses c2w [P, 4, 4] (float64) from gradients with respect to their upper rows. rates: [P, 6]; momentum:
-    Adam's first decay."""
+    """Optimises poses c2w [P, 4, 4] (float64) from gradients with respect to their upper rows. rates: [P, 6].
 
-    def __init__(self, c2w: Tensor, rates: Tensor, momentum: float = 0.9) -> None:
-        self.c2w, self._rates, self._momentum = c2w, rates, momentum
+    momentum: Adam's first decay. about: float64 [P, 3], in camera coordinates, what each camera turns about; without,
+    itself. A camera that turns about itself sees nearly what it sees when it moves sideways, and Adam, which scales
+    each number alone, is slow to tell the two apart; about the middle of what it sees they differ.
+    """
+
+    def __init__(self, c2w: Tensor, rates: Tensor, momentum: float = 0.9, about: Tensor | None = None) -> None:
+        self.c2w, self._rates, self._momentum, self._about = c2w, rates, momentum, about
         self._mean, self._square = torch.zeros_like(rates), torch.zeros_like(rates)
         self._count = 0
 
-    def step(self, d_c2w: Tensor, about: Tensor, share: float | Tensor = 1.0) -> None:
-        """One update from gradients [P, 3, 4] at ``share`` of the learning rates.
-
-        about: float64 [P, 3], in camera coordinates, what each camera turns about. A camera that turns about itself
-        sees nearly what it sees when it moves sideways, and Adam, which scales each number alone, is slow to tell the
-        two apart; about the middle of what it sees (``rays.view_centres``) they differ.
-        """
-        gradient = se3.tangent_gradient(self.c2w, d_c2w.to(self.c2w.dtype), about)
+    def step(self, d_c2w: Tensor, share: float | Tensor = 1.0) -> None:
+        """One update from gradients [P, 3, 4] at ``share`` of the learning rates."""
+        gradient = se3.tangent_gradient(self.c2w, d_c2w.to(self.c2w.dtype), self._about)
         self._count += 1
         self._mean.mul_(self._momentum).add_(gradient, alpha=1 - self._momentum)
         self._square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
         mean = self._mean / (1 - self._momentum**self._count)
         square = self._square / (1 - BETA2**self._count)
         move = -share * self._rates * mean / (square.sqrt() + EPSILON)
-        self.c2w = se3.retract(self.c2w, move, about)
+        self.c2w = se3.retract(self.c2w, move, self._about)

@@ -76,14 +76,11 @@ def make_rays(
     )
 
 
-def view_centres(rays: RayBatch, poses: int) -> Tensor:
-    """The middle of what each of so many poses measured: float64 [poses, 3], camera coordinates in metres; the camera
-    itself where no ray has a depth."""
+def view_centre(rays: RayBatch) -> Tensor:
+    """The middle of what rays of one view measured: float64 [3], camera coordinates in metres; the camera itself where
+    no ray has a depth."""
     has = (rays.depth > 0)[:, None].double()
-    sums = has.new_zeros(poses, 4).index_add_(
-        0, rays.pose, torch.cat([has * rays.direction * rays.depth[:, None], has], 1)
-    )
-    return sums[:, :3] / sums[:, 3:].clamp_min(1)
+    return (has * rays.direction * rays.depth[:, None]).sum(0) / has.sum().clamp_min(1)
 
 
 def kernel_weights(loss: LossWeights, config: Config) -> Weights:

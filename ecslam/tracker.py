@@ -17,7 +17,7 @@ from .kernels import LOSS_NAMES, Backend, RayBatch, Weights
 from .kernels.graphs import Recorder
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
-from .rays import kernel_weights, make_rays, upload, view_centres
+from .rays import kernel_weights, make_rays, upload, view_centre
 from .samples import resample_missing, uniform
 
 LEAST_SEEN = 0.1
@@ -70,8 +70,8 @@ def _descend(
     *rays: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The iterations, never waiting for the device: the best iterate [1, 4, 4] and the terms [5] there."""
-    optimiser, best, batch = PoseAdam(c2w, rates, momentum), c2w, RayBatch(*rays)
-    centre = view_centres(batch, 1)
+    batch = RayBatch(*rays)
+    optimiser, best = PoseAdam(c2w, rates, momentum, view_centre(batch)[None]), c2w
     best_terms = torch.full((len(LOSS_NAMES),), torch.inf, device=c2w.device)
     for _ in range(iterations):
         pose = optimiser.c2w.float()
@@ -80,7 +80,7 @@ def _descend(
         best = torch.where(better, optimiser.c2w, best)
         best_terms = torch.where(better, result.losses, best_terms)
         assert result.d_c2w is not None
-        optimiser.step(result.d_c2w, centre)
+        optimiser.step(result.d_c2w)
     return best, best_terms
 
 

@@ -7,20 +7,20 @@ from ecslam import se3
 from ecslam.config import TrackingConfig
 from ecslam.kernels import RayBatch
 from ecslam.pose_adam import PoseAdam, pose_rates
-from ecslam.rays import view_centres
+from ecslam.rays import view_centre
 
 
-def batch(direction, depth, pose):
+def batch(direction, depth):
     """Rays of which only the measurement matters."""
     count = len(depth)
-    color, feature = torch.zeros(count, 3), torch.zeros(count, dtype=torch.bool)
-    return RayBatch(direction, depth[:, None], depth, color, feature, pose)
+    feature, pose = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.int64)
+    return RayBatch(direction, depth[:, None], depth, torch.zeros(count, 3), feature, pose)
 
 
-def test_the_middle_of_what_each_view_measured():
-    direction = torch.tensor([[0.0, 0, 1], [1, 0, 1], [5, 5, 1], [0, 2, 1]])
-    rays = batch(direction, torch.tensor([2.0, 4, 0, 3]), torch.tensor([0, 0, 0, 2]))
-    assert view_centres(rays, 3).tolist() == [[2, 0, 3], [0, 0, 0], [0, 6, 3]]
+def test_the_middle_of_what_a_view_measured():
+    direction = torch.tensor([[0.0, 0, 1], [1, 0, 1], [5, 5, 1]])
+    assert view_centre(batch(direction, torch.tensor([2.0, 4, 0]))).tolist() == [2, 0, 3]
+    assert view_centre(batch(direction, torch.zeros(3))).tolist() == [0, 0, 0]
 
 
 def off(c2w, local, world):
@@ -31,10 +31,10 @@ def off(c2w, local, world):
 def descended(start, local, world, about, momentum):
     """Root mean squared metres that the points are off after the iterations of a frame."""
     rate = TrackingConfig().lr_rotation
-    poses = PoseAdam(start, pose_rates(torch.zeros(1, dtype=torch.bool), rate, rate), momentum)
+    poses = PoseAdam(start, pose_rates(torch.zeros(1, dtype=torch.bool), rate, rate), momentum, about)
     for _ in range(TrackingConfig().iterations):
         top = poses.c2w[:, :3].clone().requires_grad_()
-        poses.step(torch.autograd.grad(off(top, local, world), top)[0], about)
+        poses.step(torch.autograd.grad(off(top, local, world), top)[0])
     return float(off(poses.c2w, local, world)) ** 0.5
 
 
