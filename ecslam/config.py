@@ -100,14 +100,16 @@ class TrackingConfig:
     leaves it out, and direct alignment alone tracks.
 
     momentum: Adam's first decay for poses. With its usual 0.9 a pose still moves the way of its first gradients when
-    the few iterations of a frame end.
+    the few iterations of a frame end. unaligned_rate: how many times the learning rates count where no alignment comes
+    before (``align.to`` none), since constant velocity guesses a pose from farther off.
     """
 
     iterations: int = _number(8, 0, 500)
     rays: int = _number(1000, 16, 200_000)
-    lr_rotation: float = _number(4e-3, 0.0, 1.0)
-    lr_translation: float = _number(4e-3, 0.0, 1.0)
+    lr_rotation: float = _number(1e-3, 0.0, 1.0)
+    lr_translation: float = _number(1e-3, 0.0, 1.0)
     momentum: float = _number(0.5, 0.0, 0.999)
+    unaligned_rate: float = _number(4.0, 0.0, 1e3)
     loss: LossWeights = LossWeights(10.0, 200.0, 50.0, 1.0, 0.25, 5.0, 1.25)
 
 

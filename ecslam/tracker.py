@@ -51,7 +51,8 @@ def track_adam(
     rays = make_rays(upload(pixels, device), row, c2w, field.layout.box.to(device), config, jitter, missing)
     if missing:
         rays = resample_missing(rays, c2w.float(), field, kernels, s, generator)
-    rates = pose_rates(torch.zeros(1, dtype=torch.bool), t.lr_rotation, t.lr_translation).to(device)
+    scale = t.unaligned_rate if config.align.to == "none" else 1.0
+    rates = scale * pose_rates(torch.zeros(1, dtype=torch.bool), t.lr_rotation, t.lr_translation).to(device)
     weights = kernel_weights(t.loss, config)
     loop = partial(_descend, field, kernels, weights, t.iterations, t.momentum)
     tensors = (getattr(rays, f.name) for f in fields(RayBatch))

@@ -21,6 +21,7 @@ from ecslam.pixel_bank import PixelBank
 from ecslam.pixels import Pixels, choose_pixels
 from ecslam.pose_adam import pose_rates
 from ecslam.rays import upload
+from ecslam.rigid import rotation_angle_deg
 from ecslam.samples import uniform
 from ecslam.tracker import _descend, track_adam
 
@@ -141,6 +142,23 @@ def test_tracking_is_the_same_recorded_and_plain(room, config):
         assert np.array_equal(plain[0], replayed[0])
         assert plain[1:] == replayed[1:]
     assert (graphs.recorded, graphs.replayed) == (1, 2)
+
+
+def test_steps_are_longer_where_no_alignment_came_before(room, config):
+    views, poses = keyframes(room, config)
+    one = mapper(room, config)
+    one.run(views, poses, np.ones(3, bool), 100, config)
+    pixels = choose_pixels(room[1], room.intrinsics, 300, config, np.random.default_rng(0))
+    guess = np.array(room[1].c2w_gt)
+    guess[:3, 3] += 0.03
+    turned = []
+    for to in ("fused", "none"):
+        chosen = apply_settings(config, [f"align.to={to}", "tracking.iterations=2"])
+        generator = torch.Generator().manual_seed(0)
+        found, _ = track_adam(one.field, one.kernels, pixels, guess, chosen, generator, Recorder(plain=True))
+        turned.append(np.radians(rotation_angle_deg(guess, found)))
+    rate = config.tracking.lr_rotation * 3**0.5  # Adam's first step is the rate in each number
+    assert turned == pytest.approx([rate, config.tracking.unaligned_rate * rate], rel=1e-3)
 
 
 class NoKernels:

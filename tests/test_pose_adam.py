@@ -30,9 +30,10 @@ def off(c2w, local, world):
 
 def descended(start, local, world, about, momentum):
     """Root mean squared metres that the points are off after the iterations of a frame."""
-    rate = TrackingConfig().lr_rotation
-    poses = PoseAdam(start, pose_rates(torch.zeros(1, dtype=torch.bool), rate, rate), momentum, about)
-    for _ in range(TrackingConfig().iterations):
+    t = TrackingConfig()
+    rates = t.unaligned_rate * pose_rates(torch.zeros(1, dtype=torch.bool), t.lr_rotation, t.lr_translation)
+    poses = PoseAdam(start, rates, momentum, about)
+    for _ in range(t.iterations):
         top = poses.c2w[:, :3].clone().requires_grad_()
         poses.step(torch.autograd.grad(off(top, local, world), top)[0])
     return float(off(poses.c2w, local, world)) ** 0.5
