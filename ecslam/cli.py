@@ -40,7 +40,9 @@ Seed = Annotated[int | None, typer.Option(min=0, help="Random seed; default: the
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ... or auto: a CUDA GPU where there is one.")]
 Schedule = Annotated[str | None, typer.Option(help="strict (deterministic on a CPU) or overlap (two threads).")]
 Headless = Annotated[bool, typer.Option("--headless", help="No dashboard: run, write the run folder, end.")]
-Out = Annotated[Path | None, typer.Option(help="Run folder; default: runs/SEQUENCE-PRESET.")]
+Out = Annotated[
+    Path | None, typer.Option(help="Run folder; a run in it is replaced. Default: a new one, runs/SEQUENCE-PRESET.")
+]
 Data = Annotated[
     list[Path] | None,
     typer.Option(metavar="FOLDER", help="A folder with sequences that the dashboard offers too; may be repeated."),
@@ -73,7 +75,7 @@ def run(
 
     opened = commands.open_sequence(sequence)
     resolved = resolve_config(preset or opened.preset, opened.layout, config, settings, seed, schedule)
-    folder = out or Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}"
+    folder = out or commands.unused(Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}")
     offered = commands.offered(data or [])
     engine = commands.make_engine(
         resolved, sequence, opened, folder, commands.pick_device(device, resolved), frames, offered

@@ -23,7 +23,7 @@ from .messages import Notice, Quit, Snapshot, State
 from .runtime.checkpoint import load_checkpoint
 from .runtime.driven import estimate_mb, import_slam
 from .runtime.engine import Engine
-from .runtime.files import to_json
+from .runtime.files import beside, to_json
 from .runtime.judge import judge_run, read_mesh, read_truth
 from .runtime.mesh_files import mesh_bytes
 from .runtime.meshjobs import MESH_POINTS, FrozenMap, build_mesh
@@ -83,6 +83,11 @@ def _may_have_cuda() -> bool:
 def offered(roots: list[Path]) -> tuple[str, ...]:
     """The sequences that a dashboard offers: the built-in rooms and those below ``roots``. Raises InputError."""
     return (*BUILT_IN, *(address for root in roots for address in sequences_under(root)))
+
+
+def unused(folder: Path) -> Path:
+    """``folder``, or one beside it when there is something at that place."""
+    return beside(folder) if folder.exists() else folder
 
 
 def make_engine(
@@ -288,6 +293,8 @@ def remesh(folder: Path, voxel_m: float, out: Path) -> None:
 
     if out.suffix not in (".ply", ".glb", ".obj"):
         raise InputError(f"--out {out}: end the name in .ply, .glb or .obj")
+    if not out.parent.is_dir():
+        raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
     checkpoint = load_checkpoint(folder / "checkpoints")
     from . import config as configuration
 

@@ -289,6 +289,13 @@ def test_unknown_rooms_and_mesh_formats(finished, tmp_path):
     assert_refused(ecslam("check", "synthetic/studo"), "did you mean synthetic/studio")
     assert_refused(ecslam("synth", "studio", tmp_path / "x"), "synthetic/studio")
     assert_refused(ecslam("mesh", finished, "--out", tmp_path / "mesh.stl"), "mesh.stl", ".ply")
+    assert_refused(ecslam("mesh", finished, "--out", tmp_path / "no" / "mesh.ply"), "there is no folder", "no")
+
+
+def test_the_default_folder_is_a_new_one(tmp_path):
+    assert commands.unused(tmp_path / "room-live") == tmp_path / "room-live"
+    (tmp_path / "room-live").mkdir()
+    assert commands.unused(tmp_path / "room-live") == tmp_path / "room-live-2"
 
 
 def test_the_installed_command_refuses_without_a_traceback(tmp_path):

@@ -40,6 +40,7 @@ from ecslam.messages import (
     Tune,
 )
 from ecslam.runtime.checkpoint import load_checkpoint
+from ecslam.runtime.control import Control
 from ecslam.runtime.protocol import EngineHandle
 
 LONG = Behaviour(first_interrupts=100_000, pause_s=0.001)
@@ -175,6 +176,30 @@ def test_tune_and_load_preset_reach_the_engine(tmp_path):
         assert exported["tracking"]["rays"] == 2000
     log = (tmp_path / "events.jsonl").read_text()
     assert "mapping.iterations = 40 from frame 4 on" in log
+
+
+def test_steps_asked_for_while_one_is_at_work_add_up():
+    control = Control(configuration.Config(), lambda _: None, (), ())
+    control.begin(configuration.Config(), "fake", 30)
+    for _ in range(3):
+        control.submit(Step())
+    paused = []
+    for done in (1, 2, 3):
+        control.stepped(done, False)
+        paused.append(control._paused)
+    assert paused == [False, False, True]
+    control.submit(RunTo(20))
+    control.submit(Step())
+    control.stepped(4, False)
+    assert control._paused
+
+
+def test_a_restart_with_the_same_preset_keeps_the_settings_it_began_with():
+    began = configuration.apply_settings(configuration.load_preset("live"), ["mapping.iterations=12"])
+    control = Control(began, lambda _: None, (), ("live", "full"))
+    control.begin(began, "", 30)
+    assert control.restart_config(Restart(preset="live"), "").mapping.iterations == 12
+    assert control.restart_config(Restart(preset="full"), "") == configuration.load_preset("full")
 
 
 def test_restart_begins_again_beside_the_first_run(tmp_path):

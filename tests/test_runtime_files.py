@@ -4,6 +4,8 @@ import errno
 import json
 import os
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -79,14 +81,57 @@ def test_a_folder_with_other_peoples_files_is_refused(tmp_path):
     assert (tmp_path / "thesis.tex").exists()
 
 
+def test_a_recording_is_not_taken_for_a_run(tmp_path):
+    """It may hold files of the same names."""
+    for name in ("groundtruth.txt", "mesh.ply", "rgb.txt"):
+        (tmp_path / name).write_text("theirs")
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes/mine.ply").write_text("theirs")
+    with pytest.raises(InputError, match="holds other files and no run"):
+        RunFolder.create(tmp_path, print)
+    assert [p.read_text() for p in sorted(tmp_path.rglob("*.*"))] == ["theirs"] * 4
+
+
+def test_a_run_that_ended_before_it_began_is_replaced(tmp_path):
+    RunFolder.create(tmp_path, print).close()
+    RunFolder.create(tmp_path, print).close()
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from ecslam.runtime.runfolder import RunFolder
+folder = RunFolder.create(Path(sys.argv[1]), print)
+folder.write("run.json", {"sequence": "room", "frames_total": 3})
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_one_process_at_a_time_writes_a_folder(tmp_path):
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        for begin in (lambda: RunFolder.create(tmp_path, print), lambda: RunFolder.reopen(tmp_path, 1, print)):
+            with pytest.raises(InputError, match=rf"a run is at work there \(process {other.pid}\)"):
+                begin()
+        assert (tmp_path / "run.json").exists()
+        other.kill()
+    RunFolder.reopen(tmp_path, 1, print).close()
+
+
 def test_a_new_run_replaces_the_old_one_and_nothing_else(tmp_path):
     folder = RunFolder.create(tmp_path / "r", print)
+    folder.write("run.json", {"sequence": "room", "frames_total": 3})
     folder.write("summary.json", {"frames": 1})
+    folder.write("picture.png", b"old")
     folder.write("exports/mesh.ply", b"kept")
     folder.event(Notice("info", "old"))
     folder.close()
     RunFolder.create(tmp_path / "r", print).close()
     assert not (tmp_path / "r/summary.json").exists()
+    assert not (tmp_path / "r/picture.png").exists()
     assert (tmp_path / "r/events.jsonl").read_text() == ""
     assert (tmp_path / "r/exports/mesh.ply").read_bytes() == b"kept"
 

@@ -83,6 +83,7 @@ class Control:
         self.quitting = self.over = self._stop = False
         self._paused = self._announced = False
         self._pause_at: int | None = None
+        self._stepping = False
         self._restart: Restart | None = None
         self._leave_at = math.inf
 
@@ -146,7 +147,9 @@ class Control:
             self._paused, self._pause_at = False, command.frame + 1
         else:
             self._paused = isinstance(command, Pause)
-            self._pause_at = self.position + 1 if isinstance(command, Step) else None
+            ahead = self._pause_at if self._stepping and self._pause_at is not None else self.position
+            self._pause_at = ahead + 1 if isinstance(command, Step) else None
+        self._stepping = isinstance(command, Step)
         self._announced = self._announced and self._paused
 
     def _require_run(self) -> None:
@@ -197,7 +200,7 @@ class Control:
         if command.preset is not None and command.preset not in self._presets:
             raise InputError(f"preset {command.preset!r} is not on offer; there are: {', '.join(self._presets)}")
         wanted = self._started_with
-        if command.preset is not None:
+        if command.preset not in (None, wanted.preset):
             other = configuration.for_layout(configuration.load_preset(command.preset), layout)
             wanted = replace(other, seed=wanted.seed, schedule=wanted.schedule)
         given = {"seed": command.seed, "schedule": command.schedule}

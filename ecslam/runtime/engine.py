@@ -25,6 +25,7 @@ from .checkpoint import Checkpoint, load_checkpoint
 from .control import Control, Turn
 from .driven import Abandoned, SlamFactory, make_slam
 from .feed import Feed, FeedSubscription
+from .files import beside
 from .memory import keep_no_holes
 from .run import Plan, Run
 from .runfolder import RunFolder
@@ -170,7 +171,7 @@ class Engine:
 
     def _restart(self) -> Turn:
         command = self._control.take_restart()
-        plan = replace(self._plan, out=_beside(self._plan.out))
+        plan = replace(self._plan, out=beside(self._plan.out))
         self.error = self.summary = None
         try:
             if command.sequence is not None and command.sequence != plan.address:
@@ -326,13 +327,3 @@ class Engine:
 
 def _words(error: Exception) -> str:
     return str(error) or type(error).__name__
-
-
-def _beside(folder: Path) -> Path:
-    """A folder that does not exist yet: ``runs/a`` -> ``runs/a-2`` -> ``runs/a-3``."""
-    stem, dash, number = folder.name.rpartition("-")
-    base = stem if dash and number.isdigit() else folder.name
-    count = 2
-    while (candidate := folder.with_name(f"{base}-{count}")).exists():
-        count += 1
-    return candidate

@@ -29,6 +29,16 @@ def require_space(folder: Path, needed_mb: float) -> None:
         )
 
 
+def beside(folder: Path) -> Path:
+    """A folder that does not exist yet: ``runs/a`` -> ``runs/a-2`` -> ``runs/a-3``."""
+    stem, dash, number = folder.name.rpartition("-")
+    base = stem if dash and number.isdigit() else folder.name
+    count = 2
+    while (candidate := folder.with_name(f"{base}-{count}")).exists():
+        count += 1
+    return candidate
+
+
 def to_json(value: Any) -> str:
     """One line of JSON; numpy numbers and arrays become plain ones, NaN becomes null (JSON has no NaN)."""
     return json.dumps(_plain(value), separators=(",", ":"), allow_nan=False)

@@ -28,7 +28,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,18 +37,19 @@ from ..atomic import remove_temporaries, write_atomic
 from ..messages import LoopEvent, Notice, StepReport
 from ..types import InputError
 from .files import LineLog, keep_lines, read_lines, require_space, to_json
+from .folderlock import claim
 
 NEEDED_MB = 500.0
 LOGS = ("metrics.jsonl", "events.jsonl", "keyframes.jsonl")
-FILES = ("run.json", "config.yaml", "trajectory.txt", "groundtruth.txt", "mesh.ply", "summary.json")
+FILES = ("run.json", "config.yaml", "trajectory.txt", "groundtruth.txt", "mesh.ply", "summary.json", "picture.png")
 FOLDERS = ("thumbnails", "meshes", "checkpoints")
 
 
 class RunFolder:
     """Writes a run folder. problem: called once for each file that could not be saved, with a sentence for people."""
 
-    def __init__(self, path: Path, problem: Callable[[str], None]) -> None:
-        self.path = path
+    def __init__(self, path: Path, problem: Callable[[str], None], lock: IO[str] | None) -> None:
+        self.path, self._lock = path, lock
         self.not_saved: dict[str, str] = {}
         self._problem = problem
         for name in ("thumbnails", "meshes"):
@@ -59,27 +60,32 @@ class RunFolder:
     def create(cls, path: Path, problem: Callable[[str], None], needed_mb: float = NEEDED_MB) -> RunFolder:
         """Start a run in ``path``; an earlier run there is replaced.
 
-        Raises InputError when the folder takes no files, has too little space, or holds something else than a run.
+        Raises InputError when the folder takes no files, has too little space, holds something else than a run, or when
+        a run is at work there.
         """
-        foreign = path.is_dir() and any(not p.name.startswith(".") for p in path.iterdir())
-        if foreign and not any((path / name).is_file() for name in (*FILES, *LOGS)):
+        if path.is_dir() and not _holds_a_run(path):
             raise InputError(f"{path}: holds other files and no run; give --out a new or empty folder")
         require_space(path, needed_mb)
+        lock = claim(path)
         for name in (*FILES, *LOGS):
             (path / name).unlink(missing_ok=True)
         for name in FOLDERS:
             shutil.rmtree(path / name, ignore_errors=True)
-        return cls(path, problem)
+        return cls(path, problem, lock)
 
     @classmethod
     def reopen(cls, path: Path, position: int, problem: Callable[[str], None]) -> RunFolder:
-        """Go on in ``path`` from frame ``position``: what was logged for it and later frames is dropped."""
+        """Go on in ``path`` from frame ``position``: what was logged for it and later frames is dropped.
+
+        Raises InputError as ``create`` does.
+        """
         require_space(path, NEEDED_MB)
+        lock = claim(path)
         remove_temporaries(path)
         (path / "summary.json").unlink(missing_ok=True)
         for name in LOGS:
             keep_lines(path / name, lambda line: (line.get("frame") or 0) < position)
-        return cls(path, problem)
+        return cls(path, problem, lock)
 
     def write(self, name: str, data: str | bytes | dict[str, Any]) -> Path | None:
         """Replace a file (a dict becomes JSON); None when it could not be saved."""
@@ -167,13 +173,28 @@ class RunFolder:
             self.missing(name, error)
 
     def close(self) -> None:
-        """Bring the logs to the disk; what is logged later is dropped. May be called more than once."""
+        """Bring the logs to the disk and let go of the folder; what is logged later is dropped. May be called more than
+        once."""
         while self._logs:
             name, log = self._logs.popitem()
             try:
                 log.close()
             except OSError as error:
                 self.missing(name, error)
+        if self._lock is not None:
+            self._lock.close()
+
+
+def _holds_a_run(path: Path) -> bool:
+    """Whether a folder holds a run, or nothing but what a run begins with: a recording may have a ``mesh.ply`` and a
+    ``groundtruth.txt`` too."""
+    try:
+        about = json.loads((path / "run.json").read_text("utf-8"))
+        return "sequence" in about and "frames_total" in about
+    except (OSError, ValueError, TypeError):
+        ours = {*LOGS, "run.json", "config.yaml", *FOLDERS}
+        found = [p for p in path.iterdir() if not p.name.startswith(".")]
+        return all(p.name in ours and not (p.is_dir() and any(p.iterdir())) for p in found)
 
 
 def _thumbnail(frame: int) -> str:
