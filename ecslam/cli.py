@@ -77,6 +77,8 @@ def run(
     resolved = resolve_config(preset or opened.preset, opened.layout, config, settings, seed, schedule)
     folder = out or commands.unused(Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}")
     offered = commands.offered(data or [])
+    if not headless:
+        commands.require_port(host, port)
     engine = commands.make_engine(
         resolved, sequence, opened, folder, commands.pick_device(device, resolved), frames, offered
     )
@@ -123,6 +125,8 @@ def resume(
     """Go on with an interrupted run from its last checkpoint."""
     from . import commands
 
+    if not headless:
+        commands.require_port(host, port)
     engine = commands.resume_engine(folder, commands.pick_device(device), sequence)
     commands.start(engine, headless, host, port, not no_browser)
 

@@ -118,6 +118,13 @@ def resume_engine(folder: Path, device: str, sequence: str | None) -> Engine:
     return Engine.resume(folder, device=device, sequences=BUILT_IN, sequence=moved)
 
 
+def require_port(host: str, port: int) -> None:
+    """Raises InputError when the dashboard could not listen there, before a run folder is touched."""
+    from ecslam_app.front import bind
+
+    bind(host, port).close()
+
+
 def start(engine: Engine, headless: bool, host: str, port: int, browser: bool) -> None:
     """Run to the end, with or without the dashboard. The engine proper is imported while the first frames are read."""
     importing = threading.Thread(target=import_slam, name="import", daemon=True)

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import shutil
+import socket
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -283,6 +284,16 @@ def test_a_folder_with_other_things_in_it_is_not_written_to(sequence, tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
     assert_refused(ecslam("run", sequence, "--headless", "--out", tmp_path), str(tmp_path), "--out")
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_busy_port_is_found_before_a_run_is_replaced(sequence, finished, tmp_path):
+    kept = shutil.copytree(finished, tmp_path / "run")
+    before = sorted(p.name for p in kept.rglob("*"))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        for words in (("run", sequence, "--out", kept), ("resume", kept)):
+            assert_refused(ecslam(*words, "--no-browser", "--port", port), f"--port {port}", "cannot listen there")
+    assert sorted(p.name for p in kept.rglob("*")) == before
 
 
 def test_unknown_rooms_and_mesh_formats(finished, tmp_path):
