@@ -1,4 +1,4 @@
-"""The GPU kernels without a GPU: all of them in Triton's interpreter, and honest refusal where they cannot run."""
+"""The GPU kernels: all of them checked, on a GPU or in Triton's interpreter, and honest refusal where they cannot run."""
 
 import os
 import subprocess
@@ -15,10 +15,11 @@ HERE = Path(__file__).parent
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("checks", ["gpu_interpreted.py", "gpu_volume_interpreted.py"])
-def test_every_kernel_agrees_with_the_reference_in_the_interpreter(checks):
+@pytest.mark.parametrize("checks", ["gpu_checks.py", "gpu_volume_checks.py"])
+def test_every_kernel_agrees_with_the_reference(checks):
     pytest.importorskip("triton", reason="Triton is not installed, so the GPU kernels are not checked")
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
+    interpret = "0" if torch.cuda.is_available() else "1"
+    environment = {**os.environ, "TRITON_INTERPRET": interpret, "OMP_NUM_THREADS": "1"}
     command = [
         sys.executable,
         "-m",

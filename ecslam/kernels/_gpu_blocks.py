@@ -127,7 +127,9 @@ def sample(blocks, world, live):
     """At world positions (x, y, z: float64 [P]): distance in truncations and luminance, each with its derivatives by
     the lattice coordinates, and whether all eight voxels around have been seen."""
     voxel = tl.load(blocks.lengths)
-    (ix, fx), (iy, fy), (iz, fz) = cell_of(world[0], voxel), cell_of(world[1], voxel), cell_of(world[2], voxel)
+    ix, fx = cell_of(world[0], voxel)
+    iy, fy = cell_of(world[1], voxel)
+    iz, fz = cell_of(world[2], voxel)
     corner = tl.arange(0, 8)[None, :]
     a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
     kx, ky, kz = ix[:, None] + a, iy[:, None] + b, iz[:, None] + c
@@ -148,6 +150,6 @@ def distances_kernel(blocks, points, distance, total, block: tl.constexpr):
     """Signed distance [N] in metres at world points float64 [N, 3], NaN where it is unknown."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
-    (found, _, _, _), _, known = sample(blocks, triple(points + 3 * i, live), live)
+    found, _, known = sample(blocks, triple(points + 3 * i, live), live)
     truncation = tl.load(blocks.lengths + 1).to(tl.float32)
-    tl.store(distance + i, tl.where(known, found * truncation, float("nan")), live)
+    tl.store(distance + i, tl.where(known, found[0] * truncation, float("nan")), live)

@@ -47,12 +47,14 @@ def sums_kernel(
         local = triple(points + 4 * i, live)
         world = (moved(pose, local, 0), moved(pose, local, 1), moved(pose, local, 2))
         lever = (world[0] - tl.load(pose + 3), world[1] - tl.load(pose + 7), world[2] - tl.load(pose + 11))
-        (distance, gx, gy, gz), (light, lx, ly, lz), known = sample(blocks, world, live)
+        found, seen, known = sample(blocks, world, live)
+        distance, gx, gy, gz = found
+        light, lx, ly, lz = seen
         per_metre = 1 / tl.load(blocks.lengths).to(tl.float32)
         gradient = gx * per_metre, gy * per_metre, gz * per_metre
         d_light = lx * per_metre, ly * per_metre, lz * per_metre
-        seen = tl.load(points + 4 * i + 3, live, 0.0)
-        add_points(sums, distance, gradient, light, d_light, seen, lever, settings, known, colour)
+        wanted = tl.load(points + 4 * i + 3, live, 0.0)
+        add_points(sums, distance, gradient, light, d_light, wanted, lever, settings, known, colour)
 
 
 @triton.jit

@@ -64,7 +64,7 @@ def locate(field, x, rest, axis: tl.constexpr, prime: tl.constexpr, shape: tl.co
     known = level < shape.levels
     inverse = tl.load(field.inverse + 2 * level, known, 0.0)[None, :]
     correction = tl.load(field.inverse + 2 * level + 1, known, 0.0)[None, :]
-    wide = x[:, None] + tl.zeros([1, shape.width], tl.float32)
+    wide = x[:, None] + tl.full([1, shape.width], 0, tl.float32)
     cell = tl.floor(wide * inverse)
     fraction = tl.fma(wide, inverse + tl.zeros_like(wide), -cell) + (rest[:, None] * inverse + wide * correction)
     over = tl.floor(fraction)

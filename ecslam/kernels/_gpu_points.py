@@ -138,12 +138,12 @@ def decoders_kernel(
 
     A program takes every n-th block and keeps its share of the decoders' gradient in registers until the end.
     """
-    d_even_rows = tl.zeros([shape.width, WIDE], tl.float32)
-    d_odd_rows = tl.zeros([shape.width, WIDE], tl.float32)
-    d_x_rows = tl.zeros([shape.blobs, WIDE], tl.float32)
-    d_y_rows = tl.zeros([shape.blobs, WIDE], tl.float32)
-    d_z_rows = tl.zeros([shape.blobs, WIDE], tl.float32)
-    d_readers = tl.zeros([OUTPUTS, WIDE], tl.float32)
+    d_even_rows = tl.full([shape.width, WIDE], 0, tl.float32)
+    d_odd_rows = tl.full([shape.width, WIDE], 0, tl.float32)
+    d_x_rows = tl.full([shape.blobs, WIDE], 0, tl.float32)
+    d_y_rows = tl.full([shape.blobs, WIDE], 0, tl.float32)
+    d_z_rows = tl.full([shape.blobs, WIDE], 0, tl.float32)
+    d_readers = tl.full([OUTPUTS, WIDE], 0, tl.float32)
     output = tl.arange(0, OUTPUTS)[None, :]
     for number in range(tl.program_id(0), blocks, tl.num_programs(0)):
         i = number * block + tl.arange(0, block)

@@ -57,8 +57,8 @@ def count_rays(targets):
 
     Every program counts them all: a few kilobytes from the cache cost less than another launch.
     """
-    uniform, feature = tl.zeros([1024], tl.int32), tl.zeros([1024], tl.int32)
-    uniform_deep, feature_deep = tl.zeros([1024], tl.int32), tl.zeros([1024], tl.int32)
+    uniform, feature = tl.full([1024], 0, tl.int32), tl.full([1024], 0, tl.int32)
+    uniform_deep, feature_deep = tl.full([1024], 0, tl.int32), tl.full([1024], 0, tl.int32)
     for first in range(0, targets.rays, 1024):
         ray = first + tl.arange(0, 1024)
         live = ray < targets.rays

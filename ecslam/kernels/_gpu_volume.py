@@ -118,9 +118,9 @@ def touch_kernel(blocks, listed, view, stride, steps, block: tl.constexpr):
     slot = enter(blocks, listed.counts + 1, block_key(bx, by, bz), live)
     now = tl.load(view.numbers + NOW).to(tl.int32)
     stale = (slot >= 0) & (tl.load(listed.stamp + slot, slot >= 0, 0) != now)
-    last = tl.atomic_xchg(listed.stamp + slot, now + tl.zeros([block], tl.int32), stale, sem="relaxed")
+    last = tl.atomic_xchg(listed.stamp + slot, now + tl.full([block], 0, tl.int32), stale, sem="relaxed")
     first = stale & (last != now)
-    place = tl.atomic_add(listed.counts + tl.zeros([block], tl.int32), 1, first, sem="relaxed")
+    place = tl.atomic_add(listed.counts + tl.full([block], 0, tl.int32), 1, first, sem="relaxed")
     tl.store(listed.slot + place, slot.to(tl.int32), first)
 
 

@@ -1,6 +1,6 @@
-"""The fused volume's GPU kernels in Triton's interpreter against those on the CPU.
+"""The fused volume's GPU kernels against those on the CPU.
 
-Not collected by itself: ``test_kernels_gpu.py`` runs it in a process of its own (see ``gpu_interpreted.py``). Images
+Not collected by itself: ``test_kernels_gpu.py`` runs it in a process of its own (see ``gpu_checks.py``). Images
 are tiny and blocks larger than on a GPU, since the interpreter's time goes by programs.
 """
 
@@ -11,6 +11,7 @@ import pytest
 import torch
 from fake_graphs import Forbidding, launch_nothing
 from kernel_cases import relative_rms
+from on_gpu import DEVICE, INTERPRETED
 from planes import corner, look, pose
 
 from ecslam import volume_gpu
@@ -26,7 +27,6 @@ from ecslam.volume import FusedVolume, create_volume
 from ecslam.volume_gpu import GpuVolume
 
 torch.set_num_threads(1)
-CPU = torch.device("cpu")
 CAMERA = Intrinsics(48.0, 48.0, 23.6, 17.3, 48, 36)
 LENGTHS = (0.04, 0.11)  # no voxel of the corner lies exactly a truncation away
 CONFIG = Config(border_px=1, truncation_m=0.11, align=AlignConfig(gradient_range=(0.5, 1.5)))
@@ -40,8 +40,9 @@ TRUE, GUESS, FAR_GUESS = pose((2, 3, -1), (0.02, 0.01, -0.02)), pose((3, 2, 0), 
 
 @pytest.fixture(autouse=True)
 def large_blocks(monkeypatch):
-    monkeypatch.setattr(fusion_gpu, "BLOCK", 4096)
-    monkeypatch.setattr(fusion_gpu, "POINTS", 512)
+    if INTERPRETED:
+        monkeypatch.setattr(fusion_gpu, "BLOCK", 4096)
+        monkeypatch.setattr(fusion_gpu, "POINTS", 512)
     monkeypatch.setattr(volume_gpu, "SLOTS", 1 << 9)
     monkeypatch.setattr(volume_gpu, "LEAST_POINTS", 64)
 
@@ -57,7 +58,7 @@ def frame(c2w, camera=CAMERA):
 
 def both(frames, poses=POSES):
     """The volume on the CPU and that in the interpreter, after the same frames."""
-    volumes = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, CPU)
+    volumes = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, DEVICE)
     for volume in volumes:
         add(volume, frames, poses)
     return volumes
@@ -98,7 +99,8 @@ def measured(count, guess=GUESS):
 @pytest.fixture(scope="module")
 def pair():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fusion_gpu, "BLOCK", 4096)
+        if INTERPRETED:
+            patch.setattr(fusion_gpu, "BLOCK", 4096)
         patch.setattr(volume_gpu, "SLOTS", 1 << 9)
         return both(corners())
 
@@ -116,7 +118,7 @@ def test_noise_holes_edges_and_colours(width):
 def test_weights_have_a_limit(pair):
     state = pair[0].state()
     state["voxels"][..., 2] = np.where(state["voxels"][..., 2] > 0, 199, 0)
-    theirs, mine = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, CPU)
+    theirs, mine = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, DEVICE)
     for volume in (theirs, mine):
         volume.load(state)
         add(volume, corners()[:1], POSES[:1])
@@ -125,7 +127,7 @@ def test_weights_have_a_limit(pair):
 
 
 def test_depth_out_of_range_adds_nothing():
-    volume = GpuVolume(*LENGTHS, CPU)
+    volume = GpuVolume(*LENGTHS, DEVICE)
     add(volume, corners()[:1], POSES[:1], far_m=0.3)
     assert volume.used == 0
     assert not volume.distances(np.zeros((3, 3)))[1].any()
@@ -178,7 +180,7 @@ def test_a_descent_that_refuses_steps(iterations):
     frames, theirs = [frame(c2w) for c2w in POSES], Counting(*LENGTHS)
     theirs.costs = []
     add(theirs, frames)
-    mine = GpuVolume(*LENGTHS, CPU)
+    mine = GpuVolume(*LENGTHS, DEVICE)
     mine.load(theirs.state())
     settings = stages(replace(CONFIG, align=replace(CONFIG.align, colour_weight_m=1.0)))[:1]
     points = measured(300)
@@ -216,7 +218,9 @@ def test_the_rules_of_a_step(cost, used, damping, size, ended, next_damping, don
     sums[:36:9], sums[64], sums[65] = 7.0, cost, used
     before[:12], before[16:28], before[COUNT.value] = 1.0, 2.0, used
     before[COST.value], before[DAMPING.value], before[SIZE.value], before[DONE.value] = 1.0, damping, size, ended
-    step_kernel[(1,)](before, sums, after, (0.1,) * 7, 1, rules=volume_gpu.RULES, first=False)
+    there = [t.to(DEVICE) for t in (before, sums, after)]
+    step_kernel[(1,)](*there, (0.1,) * 7, 1, rules=volume_gpu.RULES, first=False)
+    after = there[2].cpu()
     gain = cost < 1 and not ended
     assert (after[:12] == (2 if gain else 1)).all()
     assert after[COST.value] == (cost if gain else 1)
@@ -227,7 +231,7 @@ def test_the_rules_of_a_step(cost, used, damping, size, ended, next_damping, don
 
 def test_a_full_table_grows_and_loses_nothing_for_long(monkeypatch):
     monkeypatch.setattr(volume_gpu, "SLOTS", 16)
-    theirs, mine, grown = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, CPU), []
+    theirs, mine, grown = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, DEVICE), []
     add(theirs, corners()[:1], POSES[:1])
     for _ in range(5):
         add(mine, corners()[:1], POSES[:1])
@@ -240,7 +244,7 @@ def test_a_full_table_grows_and_loses_nothing_for_long(monkeypatch):
 
 def test_growing_changes_nothing(monkeypatch, pair):
     monkeypatch.setattr(volume_gpu, "COPIED", 16)
-    mine = GpuVolume(*LENGTHS, CPU)
+    mine = GpuVolume(*LENGTHS, DEVICE)
     mine.load(pair[1].state())
     rows = fusion_gpu.taken_slots(mine._blocks)
     mine._load(mine._blocks.keys[rows], mine._blocks.voxels, rows, 2 * mine._blocks.slots)
@@ -249,7 +253,7 @@ def test_growing_changes_nothing(monkeypatch, pair):
 
 
 def test_state_goes_round_through_both(pair):
-    theirs, mine = FusedVolume(*LENGTHS), create_volume("gpu", *LENGTHS, CPU, Recorder())
+    theirs, mine = FusedVolume(*LENGTHS), create_volume("gpu", *LENGTHS, DEVICE, Recorder())
     theirs.load(pair[1].state())
     mine.load(pair[0].state())
     add(theirs, corners()[:1], POSES[2:])

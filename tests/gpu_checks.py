@@ -1,8 +1,9 @@
-"""The GPU kernels in Triton's interpreter against the float64 reference: every function, every gradient, ragged sizes.
+"""The GPU kernels against the float64 reference: every function, every gradient, ragged sizes.
 
-Not collected by itself: ``test_kernels_gpu.py`` runs it in a process of its own, since TRITON_INTERPRET=1 must be set
-before Triton is imported and then holds for the whole process. The interpreter's time goes by blocks, about a third of
-a second each, so sizes are small and blocks are larger than on a GPU.
+Not collected by itself: ``test_kernels_gpu.py`` runs it in a process of its own, on a GPU where there is one, else in
+Triton's interpreter, since TRITON_INTERPRET=1 must be set before Triton is imported and then holds for the whole
+process. The interpreter's time goes by blocks, about a third of a second each, so sizes are small and blocks are larger
+than on a GPU.
 """
 
 from dataclasses import fields, replace
@@ -22,6 +23,7 @@ from kernel_cases import (
     make_rays,
     relative_rms,
 )
+from on_gpu import INTERPRETED, run
 
 from ecslam.config import FieldConfig
 from ecslam.field import grow_field
@@ -39,7 +41,8 @@ FIELDS = {
 
 @pytest.fixture(autouse=True)
 def large_blocks(monkeypatch):
-    monkeypatch.setattr(gpu, "BLOCK", 64)
+    if INTERPRETED:
+        monkeypatch.setattr(gpu, "BLOCK", 64)
 
 
 def assert_close(found, expected):
@@ -51,7 +54,7 @@ def assert_close(found, expected):
 
 def assert_step(field, c2w, rays, want_params=True, want_poses=True, weights=WEIGHTS):
     mine, theirs = blank(field.params), blank(double(field.params))
-    found = gpu.step(field.layout, field.params, c2w, rays, weights, mine if want_params else None, want_poses)
+    found = run(gpu.step, field.layout, field.params, c2w, rays, weights, mine if want_params else None, want_poses)
     exact = double(field.params), c2w.double(), double(rays), weights, theirs if want_params else None, want_poses
     expected = reference.step(field.layout, *exact)
     assert_close([found.losses], [expected.losses])
@@ -67,14 +70,14 @@ def assert_step(field, c2w, rays, want_params=True, want_poses=True, weights=WEI
 
 def assert_render(field, c2w, rays):
     expected = reference.render(field.layout, double(field.params), c2w.double(), double(rays))
-    assert_close(gpu.render(field.layout, field.params, c2w, rays), expected)
+    assert_close(run(gpu.render, field.layout, field.params, c2w, rays), expected)
 
 
 def assert_fields(field, points):
     params = double(field.params)
     for function in ("values", "gradients"):
         expected = getattr(reference, function)(field.layout, params, points.double())
-        assert_close(getattr(gpu, function)(field.layout, field.params, points), expected)
+        assert_close(run(getattr(gpu, function), field.layout, field.params, points), expected)
 
 
 @pytest.mark.parametrize("count", SIZES)
@@ -142,7 +145,7 @@ def test_a_block_may_meet_many_poses_and_skip_some():
     c2w, rays = make_rays(40, 3, poses=9)
     rays = replace(rays, pose=torch.where(rays.pose == 4, 5, rays.pose))
     assert_step(make_field(), c2w, rays)
-    assert not gpu.step(make_field().layout, make_field().params, c2w, rays, WEIGHTS, None, True).d_c2w[4].any()
+    assert not run(gpu.step, make_field().layout, make_field().params, c2w, rays, WEIGHTS, None, True).d_c2w[4].any()
 
 
 def test_programs_that_take_several_blocks(monkeypatch):
@@ -157,7 +160,7 @@ def test_normal_equations(count, colour):
     luminance = torch.rand(count, generator=torch.Generator().manual_seed(2))
     c2w = make_poses(1, torch.Generator().manual_seed(3))[0]
     settings = replace(ALIGN, colour_weight=colour, gradient_low=0.05, tsdf_limit=0.3)
-    found = gpu.normal_equations(field.layout, field.params, c2w, points, luminance, settings)
+    found = run(gpu.normal_equations, field.layout, field.params, c2w, points, luminance, settings)
     exact = double(field.params), c2w.double(), points.double(), luminance.double(), settings
     expected = reference.normal_equations(field.layout, *exact)
     assert (found.used, found.inliers) == (expected.used, expected.inliers)
@@ -171,17 +174,17 @@ def test_inputs_need_not_be_contiguous():
     field, (c2w, rays) = make_field(), make_rays(12, 5)
     wide = replace(rays, z=torch.cat([rays.z, rays.z], 1)[:, ::2])
     straight = replace(wide, z=wide.z.contiguous())
-    mine = gpu.step(field.layout, field.params, c2w.mT.contiguous().mT, wide, WEIGHTS, None, True)
-    theirs = gpu.step(field.layout, field.params, c2w, straight, WEIGHTS, None, True)
-    assert torch.equal(mine.d_c2w, theirs.d_c2w)
+    mine = run(gpu.step, field.layout, field.params, c2w.mT.contiguous().mT, wide, WEIGHTS, None, True)
+    theirs = run(gpu.step, field.layout, field.params, c2w, straight, WEIGHTS, None, True)
+    assert relative_rms(mine.d_c2w, theirs.d_c2w) < CLOSE
 
 
 def test_numbers_that_are_not_numbers_stay_in_their_place():
     field, points = make_field(), make_points(20)
-    clean, _ = gpu.values(field.layout, field.params, points)
+    clean, _ = run(gpu.values, field.layout, field.params, points)
     spoiled = points.clone()
     spoiled[7], spoiled[9, 1] = float("nan"), float("inf")
-    sdf, _ = gpu.values(field.layout, field.params, spoiled)
+    sdf, _ = run(gpu.values, field.layout, field.params, spoiled)
     keep = torch.ones(20).bool()
     keep[[7, 9]] = False
     assert torch.equal(sdf[keep], clean[keep])
@@ -190,7 +193,7 @@ def test_numbers_that_are_not_numbers_stay_in_their_place():
 def test_a_layout_is_uploaded_once_and_forgotten_with_it():
     field = make_field()
     for _ in range(2):
-        gpu.values(field.layout, field.params, make_points(1))
+        run(gpu.values, field.layout, field.params, make_points(1))
     assert len([key for key in gpu._layouts if key[0] == id(field.layout)]) == 1
     before = len(gpu._layouts)
     del field
