@@ -1,4 +1,4 @@
-"""The GPU kernels: all of them checked, on a GPU or in Triton's interpreter, and honest refusal where they cannot run."""
+"""The GPU kernels: all checked, on a GPU or in Triton's interpreter, and honest refusal where they cannot run."""
 
 import os
 import subprocess
