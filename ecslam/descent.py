@@ -82,7 +82,12 @@ def moved(c2w: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float
 
 def objective(equations: NormalEquations, total: int, settings: AlignSettings) -> float:
     """Robust cost in which a dropped point counts as an outlier, so that dropping points never pays."""
+    return equations.cost + outlier_cost(settings) * (total - equations.used)
+
+
+def outlier_cost(settings: AlignSettings) -> float:
+    """What a point adds to the robust cost at most."""
     worst = settings.kernel_m**2
     if settings.colour_weight > 0:
         worst += (settings.colour_weight * settings.colour_kernel) ** 2
-    return equations.cost + 0.5 * worst * (total - equations.used)
+    return 0.5 * worst

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -74,8 +74,24 @@ class Shelf:
         return Keyframe(keyframe.frame, kept)
 
 
-def make_keyframe(frame: Frame, camera: Intrinsics, config: Config, rng: np.random.Generator) -> Keyframe:
-    """Choose and keep ``keyframe_share`` of a frame's pixels."""
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A keyframe made before its turn, and the configuration it was made by."""
+
+    config: Config
+    keyframe: Keyframe
+
+
+def prepared(frame: Frame, camera: Intrinsics, config: Config) -> Frame:
+    """The frame with the keyframe that it will become, for ``make_keyframe`` to find."""
+    return replace(frame, keyframe=Prepared(config, make_keyframe(frame, camera, config)))
+
+
+def make_keyframe(frame: Frame, camera: Intrinsics, config: Config) -> Keyframe:
+    """Choose and keep ``keyframe_share`` of a frame's pixels, the same whoever asks."""
+    if isinstance(frame.keyframe, Prepared) and frame.keyframe.config == config:
+        return frame.keyframe.keyframe
+    rng = np.random.default_rng([config.seed, frame.index])
     count = max(64, round(config.keyframe_share * frame.depth.size))
     pixels = choose_pixels(frame, camera, count, config, rng, rim=config.mapping.rim)
     if not config.sampling.without_depth:

@@ -9,23 +9,25 @@ from .pixels import Pixels
 
 BITS = 21
 HALF = 1 << (BITS - 1)
+VOXEL_M = 0.05
 LEAST_KNOWN = 100
 
 
 class ObservedVoxels:
-    """Voxels of ``voxel_m`` metres that hold at least one measured surface point."""
+    """Voxels of ``VOXEL_M`` metres that hold at least one measured surface point. views: how many have been added."""
 
-    def __init__(self, voxel_m: float = 0.05) -> None:
-        self.voxel_m = voxel_m
+    def __init__(self) -> None:
+        self.views = 0
         self.keys: NDArray[np.int64] = np.empty(0, np.int64)
 
     def _keys(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        cell = np.floor(points / self.voxel_m).astype(np.int64) + HALF
+        cell = np.floor(points / VOXEL_M).astype(np.int64) + HALF
         return (cell[:, 0] << (2 * BITS)) | (cell[:, 1] << BITS) | cell[:, 2]
 
-    def add(self, points: NDArray[np.floating]) -> None:
-        """Mark the voxels of world points [N, 3]."""
-        self.keys = np.union1d(self.keys, self._keys(points))
+    def add(self, local: NDArray[np.float32], c2w: NDArray[np.float64]) -> None:
+        """Mark the voxels of a view's points [N, 3], given in its camera, c2w [4, 4]."""
+        self.views += 1
+        self.keys = np.union1d(self.keys, self._keys((local @ c2w[:3, :3].T + c2w[:3, 3]).astype(np.float32)))
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """bool [N]: whether each world point [N, 3] lies in a marked voxel."""
@@ -43,3 +45,11 @@ class ObservedVoxels:
         if len(index) < LEAST_KNOWN:
             return pixels
         return pixels.take(np.resize(index, len(pixels)) if same_count else index)
+
+    def state(self) -> dict[str, NDArray[np.int64]]:
+        """For a checkpoint."""
+        return {"keys": self.keys, "views": np.array(self.views)}
+
+    def load(self, state: dict[str, NDArray[np.int64]]) -> None:
+        """Go on from what ``state`` gave."""
+        self.keys, self.views = np.array(state["keys"], np.int64), int(state["views"])

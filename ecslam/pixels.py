@@ -58,7 +58,7 @@ class Points:
 def find_corners(color: NDArray[np.uint8], config: Config) -> Corners:
     """The ``feature_count`` strongest Shi-Tomasi corners of an RGB image [H, W, 3]."""
     height, width = color.shape[:2]
-    border, none = _border(config, height, width), np.empty(0, np.int64)
+    border, none = border_of(config, height, width), np.empty(0, np.int64)
     if config.feature_count <= 0:
         return Corners(none, _corner_settings(config))
     gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[border : height - border, border : width - border]
@@ -81,11 +81,16 @@ def _corner_settings(config: Config) -> tuple[float, ...]:
     return config.feature_count, config.feature_quality, config.feature_distance_px, config.border_px
 
 
+def grid_shape(height: int, width: int, count: int) -> tuple[int, int]:
+    """Rows and columns of the uniform grid of at least ``count`` nearly square cells."""
+    rows = max(1, int(np.ceil(np.sqrt(count * height / width))))
+    return rows, max(1, int(np.ceil(count / rows)))
+
+
 def grid_points(height: int, width: int, border: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Flat indices of exactly ``count`` pixels, one in each cell of a uniform grid, jittered inside its cell."""
     h, w = height - 2 * border, width - 2 * border
-    rows = max(1, int(np.ceil(np.sqrt(count * h / w))))
-    columns = max(1, int(np.ceil(count / rows)))
+    rows, columns = grid_shape(h, w, count)
     cell = np.arange(rows * columns)
     if len(cell) > count:
         cell = np.sort(rng.choice(cell, count, replace=False))
@@ -103,7 +108,7 @@ def choose_pixels(
     rim: whether the grid (or the random choice) reaches into the image's border.
     """
     height, width = frame.depth.shape
-    border = 0 if rim else _border(config, height, width)
+    border = 0 if rim else border_of(config, height, width)
     if config.fus:
         corners = feature_points(frame, config, count // 2)
         rest = grid_points(height, width, border, count - len(corners), rng)
@@ -119,7 +124,7 @@ def choose_pixels(
 def spread_pixels(frame: Frame, camera: Intrinsics, count: int, config: Config, rng: np.random.Generator) -> Pixels:
     """``count`` pixels of a frame from the jittered grid alone, which costs no feature detection."""
     height, width = frame.depth.shape
-    index = grid_points(height, width, _border(config, height, width), count, rng)
+    index = grid_points(height, width, border_of(config, height, width), count, rng)
     return _read(frame, camera, index, np.zeros(count, bool), config)
 
 
@@ -133,5 +138,6 @@ def _read(
     return Pixels(direction, depth, frame.color.reshape(-1, 3)[index], feature)
 
 
-def _border(config: Config, height: int, width: int) -> int:
+def border_of(config: Config, height: int, width: int) -> int:
+    """How many pixels at an image's edges are ignored."""
     return min(config.border_px, (min(height, width) - 1) // 4)

@@ -34,7 +34,7 @@ class DevicePixels:
 def upload(pixels: Pixels, device: torch.device) -> DevicePixels:
     """The same pixels on ``device``."""
     return DevicePixels(
-        torch.nn.functional.pad(torch.from_numpy(pixels.direction), (0, 1), value=1.0).to(device),
+        torch.nn.functional.pad(torch.from_numpy(pixels.direction).to(device), (0, 1), value=1.0),
         torch.from_numpy(pixels.depth).to(device),
         torch.from_numpy(pixels.color).to(device),
         torch.from_numpy(pixels.feature).to(device),

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from . import kernels as seam
-from .align import LearnedSurface, Surface, align, cost_at, known_points
+from .align import LearnedSurface, Surface
 from .config import Config
 from .field import TsdfField, box_of_points, create_field
 from .indices import evenly
@@ -26,23 +26,22 @@ from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
 from .observed import ObservedVoxels
-from .pixels import Pixels, choose_pixels, spread_pixels
+from .observed_gpu import ObservedTable
+from .pixels import Pixels, spread_pixels
 from .recovery import Recovery, around, best_start, search
-from .samples import seeded
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
-from .tracker import TrackResult, fit, track_adam, track_direct
+from .tracker import LEAST_POINTS, HostTracker, Tracker, TrackResult, track_direct
 from .trajectory import Trajectory
 from .types import Frame, FrameError, InputError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
-from .volume import create_volume
+from .volume import FusedVolume, create_volume
 from .window import random_window, select_window
 
 Interrupt = Callable[[], None]
-LEAST_POINTS = 64
-WORSE = 1.02  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
 RELOCALISE_FROM = 5
 GAP_S = 1.0
 OUTSIDE_SHARE = 0.01
+BOX_POINTS = 8192  # of a keyframe, looked at to see whether the box holds them
 RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
 SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
 
@@ -77,15 +76,26 @@ class Slam:
         self._bounds = bounds if box is None else np.array(box, np.float64).reshape(2, 3)
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
-        self._observed = ObservedVoxels()
         lengths, fused = (config.align.voxel_m, config.truncation_m), config.align.to == "fused"
         self._volume = create_volume(self.kernels_name, *lengths, self.device, self._recorder) if fused else None
+        self._observed: ObservedVoxels | ObservedTable = ObservedVoxels()
+        self._gpu_tracker: Tracker | None = None
+        if self.kernels_name == "gpu" and fused:
+            self._observed, self._gpu_tracker = self._on_gpu()
+        self._trained = 0
         self._loops, self._recovery = LoopDetector(), Recovery()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
         self._pending: Future[MapResult] | None = None
         self._window: NDArray[np.int64] = np.empty(0, np.int64)
         self._frozen: TsdfField | None = None
         self._note, self._outside, self._graphs_failed = "", 0.0, False
+
+    def _on_gpu(self) -> tuple[ObservedTable, Tracker]:
+        from .tracker_gpu import GpuTracker
+
+        assert not isinstance(self._volume, FusedVolume | None)
+        observed = ObservedTable(self.device)
+        return observed, GpuTracker(self.intrinsics, self._volume, observed, self._kernels, self._recorder)
 
     # ---- one frame --------------------------------------------------------------------------------------------------
 
@@ -104,7 +114,7 @@ class Slam:
         tracked = time.perf_counter()
         losses, loop = track.losses, None
         if keyframe:
-            keyframe_now = make_keyframe(frame, self.intrinsics, self.config, self._rng)
+            keyframe_now = make_keyframe(frame, self.intrinsics, self.config)
             self.keyframes.append(self._shelf.keep(keyframe_now))
         if keyframe and index % self.config.mapping.every == 0:
             losses, loop = self._map(frame.index, interrupt)
@@ -125,7 +135,7 @@ class Slam:
 
     def _first_frame(self, frame: Frame, interrupt: Interrupt | None) -> StepReport:
         started = time.perf_counter()
-        keyframe = make_keyframe(frame, self.intrinsics, self.config, self._rng)
+        keyframe = make_keyframe(frame, self.intrinsics, self.config)
         if len(keyframe.pixels.points()) == 0:
             raise FrameError(f"frame {frame.index}: no usable depth, so the map cannot start here")
         box = self._bounds
@@ -186,41 +196,33 @@ class Slam:
         """Constant-velocity start, the preset's tracker, and recovery when the map does not explain the frame."""
         gap = frame.timestamp - self.trajectory.timestamps[-1] > GAP_S
         guess = self.trajectory[-1] if self._recovery.lost or gap else self.trajectory.predict()
-        measured = spread_pixels(frame, self.intrinsics, self.config.align.points, self.config, self._rng)
-        usable = len(measured.points()) >= LEAST_POINTS
-        track = TrackResult(guess, {}, 0.0)
-        if usable:
-            starts = around(guess) if gap else [guess]
-            track = best_start(lambda start: self._track_from(frame, measured, start), starts)
-        return self._recovery.judge(
-            track, self.trajectory[-1], lambda: self._relocalise(frame, measured) if usable else None
+        field, config, tracker = self._require_field(), self.config, self._tracker()
+        track = best_start(
+            lambda start: tracker.track(frame, start, field, config, self._rng), around(guess) if gap else [guess]
         )
+        return self._recovery.judge(track, self.trajectory[-1], lambda: self._relocalise(frame))
 
-    def _track_from(self, frame: Frame, measured: Pixels, guess: NDArray[np.float64]) -> TrackResult:
-        """Direct alignment of the ``measured`` points, then the paper's rendered tracking; the preset may leave either
-        out."""
-        config, surface = self.config, self._surface()
-        c2w, losses = guess, {}
-        points = known_points(surface, measured, guess)
-        if config.align.to != "none":
-            found = align(surface, points, guess, config)
-            c2w, losses = found.c2w, {"align_mm": 1e3 * found.cost**0.5}
-        if config.tracking.iterations > 0:
-            pixels = choose_pixels(frame, self.intrinsics, config.tracking.rays, config, self._rng)
-            pixels = self._observed.known(pixels, c2w, same_count=not self._on_cpu)
-            generator = self._generator if self._on_cpu else seeded(self._rng, self.device)
-            rendered, losses = track_adam(
-                self._require_field(), self._kernels, pixels, c2w, config, generator, self._recorder
-            )
-            agreed = WORSE * cost_at(surface, points, c2w, config)
-            if config.align.to == "none" or cost_at(surface, points, rendered, config) <= agreed:
-                c2w = rendered
-        return TrackResult(c2w, losses, fit(surface, measured, c2w, config.truncation_m))
+    def _tracker(self) -> Tracker:
+        if self.config.tracking.iterations > 0:
+            self._see()
+        if self._gpu_tracker is not None:
+            return self._gpu_tracker
+        assert isinstance(self._observed, ObservedVoxels)
+        generator = self._generator if self._on_cpu else None
+        return HostTracker(self.intrinsics, self._surface(), self._observed, self._kernels, generator, self._recorder)
+
+    def _see(self) -> None:
+        """Bring up to date where the map has been observed."""
+        for view in range(self._observed.views, self._trained):
+            pose = self.trajectory.keyframe_poses()[view]
+            self._observed.add(self.keyframes[view].pixels.points(), pose)
 
     def _surface(self) -> Surface:
         return self._volume if self._volume is not None else self._learned()
 
     def _learned(self) -> LearnedSurface:
+        self._see()
+        assert isinstance(self._observed, ObservedVoxels)
         return LearnedSurface(self._require_field(), self._kernels, self.config.truncation_m, self._observed)
 
     def _fuse(self, frame: Frame) -> None:
@@ -228,9 +230,12 @@ class Slam:
             near, far = self.config.depth_near_m, self.config.depth_far_m
             self._volume.integrate(frame, self.intrinsics, self.trajectory[-1], near, far)
 
-    def _relocalise(self, frame: Frame, measured: Pixels) -> TrackResult:
+    def _relocalise(self, frame: Frame) -> TrackResult | None:
         """Direct alignment with a wide basin from the last pose, the keyframes that look most alike, and the poses that
-        a search around these finds."""
+        a search around these finds; None where hardly anything is measured."""
+        measured = spread_pixels(frame, self.intrinsics, self.config.align.points, self.config, self._rng)
+        if len(measured.points()) < LEAST_POINTS:
+            return None
         poses, surface = self.trajectory.keyframe_poses(), self._surface()
         alike = most_similar(self.keyframes, make_thumbnail(frame.color), RELOCALISE_FROM)
         wide = replace(self.config, align=replace(self.config.align, kernels_m=RELOCALISE_KERNELS_M, iterations=20))
@@ -287,8 +292,9 @@ class Slam:
         if result.failed:
             self._note = "the mapping diverged and was undone"
             return
-        trained = max(len(self.keyframes) - 2, 0)  # its surface has been through two mappings by now
-        self._observed.add(_world(self.keyframes[trained].pixels, self.trajectory.keyframe_poses()[trained]))
+        self._trained = max(
+            len(self.keyframes) - 1, 1
+        )  # the surface that these saw has been through two mappings by now
         self.trajectory.move_keyframes(self._window, result.c2w)
         self._frozen = self._tracking_field()
 
@@ -307,7 +313,8 @@ class Slam:
         """Extend the scene box when over 1 % of the newest keyframe's points lie outside it; one from the configuration
         stays, and a note says how many."""
         assert self.mapper is not None
-        points = _world(self.keyframes[-1].pixels, self.trajectory[-1])
+        pixels = self.keyframes[-1].pixels
+        points = _world(pixels.take(evenly(len(pixels), BOX_POINTS)), self.trajectory[-1])
         low, high = self.mapper.field.layout.box.numpy()
         outside = ((points < low) | (points > high)).any(1).mean() if len(points) else 0.0
         if self.config.field.box is None and outside > OUTSIDE_SHARE:
@@ -360,7 +367,7 @@ class Slam:
             **prefixed("mapper", self.mapper.state()),
             **prefixed("random", pack_random(self._rng, self._generator)),
             "bounds": np.zeros((0, 3)) if self._bounds is None else self._bounds,
-            "observed": self._observed.keys,
+            **prefixed("observed", self._observed.state() | {"trained": np.array(self._trained)}),
             **prefixed("volume", self._volume.state() if self._volume is not None else {}),
             "inside_loop": np.array(self._loops.inside),
             "lost": np.array([self._recovery.lost, self._recovery.misses, self._recovery.usual_fit]),
@@ -378,7 +385,8 @@ class Slam:
         self.mapper = Mapper.restore(part("mapper", state), self._kernels, self.device, self._new_recorder())
         self._frozen = self._tracking_field()
         unpack_random(part("random", state), self._rng, self._generator)
-        self._observed.keys = np.array(state["observed"], np.int64)
+        self._observed.load(part("observed", state))
+        self._trained = int(state["observed.trained"])
         if self._volume is not None:
             self._volume.load(part("volume", state))
         self._loops.inside = bool(state["inside_loop"])

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .align import Surface, align, known_points, transform
+from .align import Surface, align, cost_at, known_points, transform
 from .config import Config
 from .field import TsdfField
 from .kernels import LOSS_NAMES, Backend, RayBatch, Weights
 from .kernels.graphs import Recorder
-from .pixels import Pixels
+from .observed import ObservedVoxels
+from .pixels import Pixels, choose_pixels, spread_pixels
 from .pose_adam import PoseAdam, pose_rates
 from .rays import kernel_weights, make_rays, upload, view_centre
-from .samples import resample_missing, uniform
+from .samples import resample_missing, seeded, uniform
+from .types import Frame, Intrinsics
 
 LEAST_SEEN = 0.1
+LEAST_POINTS = 64  # that are measured, or a frame is not tracked
+WORSE = 1.02  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,53 @@ class TrackResult:
     c2w: NDArray[np.float64]
     losses: dict[str, float]
     fit: float
+
+
+class Tracker(Protocol):
+    """Follows the camera from frame to frame."""
+
+    def track(
+        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, rng: np.random.Generator
+    ) -> TrackResult:
+        """The pose of a frame, sought from ``guess`` [4, 4]; ``guess`` itself with a fit of 0 where hardly anything is
+        measured."""
+        ...
+
+
+@dataclass(frozen=True)
+class HostTracker:
+    """Tracking that the host goes through step by step. surface: what frames are aligned to. observed: where the map
+    may be trusted. generator: for the samples along rays; None: one from ``rng`` on the field's device."""
+
+    camera: Intrinsics
+    surface: Surface
+    observed: ObservedVoxels
+    kernels: Backend
+    generator: torch.Generator | None
+    recorder: Recorder
+
+    def track(
+        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, rng: np.random.Generator
+    ) -> TrackResult:
+        """See ``Tracker``. Direct alignment of points spread over the image, then the paper's rendered tracking; the
+        preset may leave either out."""
+        surface, measured = self.surface, spread_pixels(frame, self.camera, config.align.points, config, rng)
+        if len(measured.points()) < LEAST_POINTS:
+            return TrackResult(guess, {}, 0.0)
+        c2w, losses = guess, {}
+        points = known_points(surface, measured, guess)
+        if config.align.to != "none":
+            found = align(surface, points, guess, config)
+            c2w, losses = found.c2w, {"align_mm": 1e3 * found.cost**0.5}
+        if config.tracking.iterations > 0:
+            pixels = choose_pixels(frame, self.camera, config.tracking.rays, config, rng)
+            pixels = self.observed.known(pixels, c2w, same_count=field.device.type != "cpu")
+            generator = self.generator or seeded(rng, field.device)
+            rendered, losses = track_adam(field, self.kernels, pixels, c2w, config, generator, self.recorder)
+            agreed = WORSE * cost_at(surface, points, c2w, config)
+            if config.align.to == "none" or cost_at(surface, points, rendered, config) <= agreed:
+                c2w = rendered
+        return TrackResult(c2w, losses, fit(surface, measured, c2w, config.truncation_m))
 
 
 def track_adam(
@@ -54,13 +106,13 @@ def track_adam(
     scale = t.unaligned_rate if config.align.to == "none" else 1.0
     rates = scale * pose_rates(torch.zeros(1, dtype=torch.bool), t.lr_rotation, t.lr_translation).to(device)
     weights = kernel_weights(t.loss, config)
-    loop = partial(_descend, field, kernels, weights, t.iterations, t.momentum)
+    loop = partial(descend_rendered, field, kernels, weights, t.iterations, t.momentum)
     tensors = (getattr(rays, f.name) for f in fields(RayBatch))
     best, terms = recorder(loop, c2w, rates, *tensors, key=(weights, t.iterations, t.momentum), over=(field,))
     return best[0].cpu().numpy(), dict(zip(LOSS_NAMES, terms.tolist(), strict=True))
 
 
-def _descend(
+def descend_rendered(
     field: TsdfField,
     kernels: Backend,
     weights: Weights,

@@ -49,8 +49,7 @@ class Trajectory:
 
     def move_keyframes(self, index: NDArray[np.int64], c2w: NDArray[np.float64]) -> None:
         """Set keyframe poses [K, 4, 4] at ``index`` [K]; the frames that hang on them follow."""
-        for i, pose in zip(index.tolist(), c2w, strict=True):
-            self._keyframes[i] = se3.orthonormalise(pose)
+        self._keyframes[index] = se3.orthonormalise(c2w)
 
     def poses(self) -> NDArray[np.float64]:
         """Poses [N, 4, 4] of all frames."""

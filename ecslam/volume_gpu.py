@@ -15,6 +15,7 @@ from .kernels import AlignSettings, NormalEquations, fusion_gpu
 from .kernels.fusion import EDGE
 from .kernels.graphs import Recorder
 from .pixels import Points
+from .pixels_gpu import DeviceFrame
 from .types import Frame, Intrinsics
 from .volume import STRIDE
 
@@ -26,7 +27,7 @@ RULES = fusion_gpu.Rules(*DAMPING, SETTLED, *STILL, LEAST_USED)
 
 
 class GpuVolume:
-    """See ``FusedVolume``; the same on a GPU, up to rounding."""
+    """See ``FusedVolume``; the same on a GPU, up to rounding. blocks: the table, which the kernels read."""
 
     def __init__(
         self, voxel_m: float, truncation_m: float, device: torch.device, recorder: Recorder | None = None
@@ -35,11 +36,12 @@ class GpuVolume:
         self.voxel_m, self.truncation_m, self._device = voxel_m, truncation_m, device
         self._record = recorder or Recorder()
         self._now = 0
+        self._shown: tuple[Frame, DeviceFrame] | None = None
         self._taken = torch.zeros(2, dtype=torch.int32, pin_memory=device.type == "cuda")
         self._allocate(SLOTS)
 
     def _allocate(self, slots: int) -> None:
-        self._blocks, self._listed = fusion_gpu.allocate(slots, self.voxel_m, self.truncation_m, self._device)
+        self.blocks, self._listed = fusion_gpu.allocate(slots, self.voxel_m, self.truncation_m, self._device)
         self._record.forget()
 
     @property
@@ -55,41 +57,46 @@ class GpuVolume:
         self._now += 1
         numbers = [*c2w[:3].flat, camera.fx, camera.fy, camera.cx, camera.cy, near_m, far_m, self._now]
         steps = int(np.ceil(2 * self.truncation_m / (0.5 * EDGE * self.voxel_m))) + 1
-        fusion_gpu.fuse(
-            self._blocks,
-            self._listed,
-            self._upload(torch.from_numpy(np.ascontiguousarray(frame.depth))),
-            self._upload(torch.from_numpy(np.ascontiguousarray(frame.color))),
-            self._upload(torch.tensor(numbers, dtype=torch.float64)),
-            STRIDE,
-            steps,
-        )
-        self._taken.copy_(self._listed.counts, non_blocking=True)
+        blocks, listed, shown = self.blocks, self._listed, self.show(frame)
+
+        def whole(depth: Tensor, color: Tensor, numbers: Tensor) -> tuple[Tensor]:
+            fusion_gpu.fuse(blocks, listed, depth, color, numbers, STRIDE, steps)
+            return (listed.counts,)
+
+        given = shown.depth, shown.color, self._upload(torch.tensor(numbers, dtype=torch.float64))
+        (counts,) = self._record(whole, *given, key=steps, over=(blocks,))
+        self._taken.copy_(counts, non_blocking=True)
+
+    def show(self, frame: Frame) -> DeviceFrame:
+        """The frame's images on the device; the last one's are kept."""
+        if self._shown is None or self._shown[0] is not frame:
+            self._shown = frame, DeviceFrame.of(frame, self._device)
+        return self._shown[1]
 
     def _upload(self, tensor: Tensor) -> Tensor:
         return tensor.to(self._device, non_blocking=True)
 
     def _grow_in_time(self) -> None:
         """Double a table that was over half full when the device last told; nothing waits for the newest number."""
-        if int(self._taken[1]) > MOST_TAKEN * self._blocks.slots:
-            keys, voxels, rows = self._blocks.keys, self._blocks.voxels, fusion_gpu.taken_slots(self._blocks)
-            self._load(keys[rows], voxels, rows, 2 * self._blocks.slots)
+        if int(self._taken[1]) > MOST_TAKEN * self.blocks.slots:
+            keys, voxels, rows = self.blocks.keys, self.blocks.voxels, fusion_gpu.taken_slots(self.blocks)
+            self._load(keys[rows], voxels, rows, 2 * self.blocks.slots)
 
     def _load(self, keys: Tensor, voxels: Tensor, rows: Tensor, slots: int) -> None:
         """Start again with blocks ``keys`` [N], whose voxels are the ``rows`` [N] of ``voxels``."""
         self._allocate(slots)
-        found = fusion_gpu.enter(self._blocks, self._listed, keys)
+        found = fusion_gpu.enter(self.blocks, self._listed, keys)
         while bool((found < 0).any()):
-            self._allocate(2 * self._blocks.slots)
-            found = fusion_gpu.enter(self._blocks, self._listed, keys)
+            self._allocate(2 * self.blocks.slots)
+            found = fusion_gpu.enter(self.blocks, self._listed, keys)
         for part, into in zip(rows.split(COPIED), found.split(COPIED), strict=True):
-            self._blocks.voxels[into] = voxels[part].to(self._device)
+            self.blocks.voxels[into] = voxels[part].to(self._device)
         self._taken.copy_(self._listed.counts)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """See ``FusedVolume.state``; blocks come in the order of the table."""
-        rows = fusion_gpu.taken_slots(self._blocks)
-        return {"place": self._blocks.keys[rows].cpu().numpy(), "voxels": self._blocks.voxels[rows].cpu().numpy()}
+        rows = fusion_gpu.taken_slots(self.blocks)
+        return {"place": self.blocks.keys[rows].cpu().numpy(), "voxels": self.blocks.voxels[rows].cpu().numpy()}
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from what ``state`` gave, here or in a ``FusedVolume``."""
@@ -100,14 +107,14 @@ class GpuVolume:
     def distances(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """See ``FusedVolume.distances``; 0 where nothing is known."""
         at = self._upload(torch.from_numpy(np.ascontiguousarray(points, np.float64)))
-        found = fusion_gpu.distances(self._blocks, at).cpu().numpy()
+        found = fusion_gpu.distances(self.blocks, at).cpu().numpy()
         known = ~np.isnan(found)
         return np.where(known, found, np.float32(0)), known
 
     def normal_equations(self, c2w: NDArray[np.float64], points: Points, settings: AlignSettings) -> NormalEquations:
         """See ``FusedVolume.normal_equations``."""
         packed, start = self._packed(points), self._start(c2w, points)
-        sums = fusion_gpu.sums_at(self._blocks, packed, start, settings).cpu()
+        sums = fusion_gpu.sums_at(self.blocks, packed, start, settings).cpu()
         products, (cost, used, inliers) = sums[:64].view(8, 8), sums[64:].tolist()
         return NormalEquations(products[:6, :6].clone(), products[:6, 6].clone(), cost, int(used), int(inliers))
 
@@ -115,7 +122,7 @@ class GpuVolume:
         self, points: Points, guess: NDArray[np.float64], settings: Sequence[AlignSettings], iterations: int
     ) -> Alignment:
         """See ``descent.descend``: one launch of a recorded graph, and one wait, for its result."""
-        blocks, stages = self._blocks, tuple(settings)
+        blocks, stages = self.blocks, tuple(settings)
 
         def whole(packed: Tensor, start: Tensor) -> tuple[Tensor]:
             return (fusion_gpu.descend(blocks, packed, start, stages, iterations, COARSE_STRIDE, RULES),)

@@ -11,17 +11,23 @@ import pytest
 import torch
 from fake_graphs import Forbidding, launch_nothing
 from kernel_cases import relative_rms
-from on_gpu import DEVICE, INTERPRETED
+from on_gpu import DEVICE, INTERPRETED, moved
 from planes import corner, look, pose
 
 from ecslam import volume_gpu
 from ecslam.align import align, known_points, stages
-from ecslam.config import AlignConfig, Config
+from ecslam.config import AlignConfig, Config, FieldConfig, SamplingConfig, TrackingConfig
 from ecslam.descent import descend
-from ecslam.kernels import fusion_gpu
+from ecslam.field import TsdfField, create_field
+from ecslam.kernels import LOSS_NAMES, fusion_gpu, gpu, reference
 from ecslam.kernels._gpu_descent import COST, COUNT, DAMPING, DONE, EQUATIONS, ROW, SIZE, step_kernel
 from ecslam.kernels.graphs import Recorder
+from ecslam.observed import ObservedVoxels
+from ecslam.observed_gpu import ObservedTable
 from ecslam.pixels import Points, spread_pixels
+from ecslam.pixels_gpu import DeviceFrame, grid_cells
+from ecslam.tracker import HostTracker
+from ecslam.tracker_gpu import HEADER, GpuTracker
 from ecslam.types import Intrinsics
 from ecslam.volume import FusedVolume, create_volume
 from ecslam.volume_gpu import GpuVolume
@@ -235,7 +241,7 @@ def test_a_full_table_grows_and_loses_nothing_for_long(monkeypatch):
     add(theirs, corners()[:1], POSES[:1])
     for _ in range(5):
         add(mine, corners()[:1], POSES[:1])
-        grown.append((mine.used, mine._blocks.slots))
+        grown.append((mine.used, mine.blocks.slots))
     assert grown == [(16, 16), (32, 32), (64, 64), (66, 128), (66, 256)]
     (place, voxels), (my_place, my_voxels) = ordered(theirs), ordered(mine)
     np.testing.assert_array_equal(my_place, place)
@@ -246,8 +252,8 @@ def test_growing_changes_nothing(monkeypatch, pair):
     monkeypatch.setattr(volume_gpu, "COPIED", 16)
     mine = GpuVolume(*LENGTHS, DEVICE)
     mine.load(pair[1].state())
-    rows = fusion_gpu.taken_slots(mine._blocks)
-    mine._load(mine._blocks.keys[rows], mine._blocks.voxels, rows, 2 * mine._blocks.slots)
+    rows = fusion_gpu.taken_slots(mine.blocks)
+    mine._load(mine.blocks.keys[rows], mine.blocks.voxels, rows, 2 * mine.blocks.slots)
     for old, new in zip(ordered(pair[1]), ordered(mine), strict=True):
         np.testing.assert_array_equal(old, new)
 
@@ -271,3 +277,76 @@ def test_nothing_waits_for_the_host(monkeypatch):
         fusion_gpu.fuse(blocks, listed, depth, color, torch.zeros(19, device="meta"), 4, 3)
         row = fusion_gpu.descend(blocks, points, start, tuple(stages(CONFIG)), 10, 4, volume_gpu.RULES)
     assert row.shape == start.shape
+
+
+TINY = replace(
+    CONFIG, feature_count=20, align=replace(CONFIG.align, points=300), tracking=TrackingConfig(iterations=0),
+    field=FieldConfig(levels=4, log2_table_size=10, blob_bins=4), sampling=SamplingConfig(uniform=4, near_depth=3),
+)  # fmt: skip
+
+
+def trackers(pair):
+    """The camera's follower on the host and that on the device, over the same surface, and a map that knows nothing."""
+    observed, table = ObservedVoxels(), ObservedTable(DEVICE)
+    for seen in (observed, table):
+        seen.add(spread_pixels(corners()[0], CAMERA, 1500, CONFIG, np.random.default_rng(0)).points(), POSES[0])
+    field = create_field(TINY.field, np.array([[-2.0, -2, 0], [2, 2, 3]]), 0, torch.device("cpu"))
+    host = HostTracker(CAMERA, pair[0], observed, reference, torch.Generator(), Recorder(plain=True))
+    device = GpuTracker(CAMERA, pair[1], table, gpu, Recorder())
+    return (host, field), (device, TsdfField(field.layout, moved(field.params, DEVICE)))
+
+
+def test_a_frame_is_tracked_as_on_the_host(pair):
+    seen = look(TRUE, corner(), CAMERA)
+    for tracker, field in trackers(pair):
+        for repeat in range(2):  # the second one is recorded, where that can be
+            found = tracker.track(seen, GUESS, field, TINY, np.random.default_rng(repeat))
+            np.testing.assert_allclose(found.c2w, TRUE, atol=4e-3)
+            assert found.fit > 0.95
+            assert 0 < found.losses["align_mm"] < 5
+
+
+def test_a_rendered_pose_is_taken_only_where_the_surface_agrees(pair):
+    seen = look(TRUE, corner(), CAMERA)
+    rendered = replace(TINY, tracking=TrackingConfig(iterations=2, rays=60, lr_rotation=1e-5, lr_translation=1e-5))
+    astray = replace(rendered, tracking=replace(rendered.tracking, iterations=5, lr_translation=0.02))
+    for tracker, field in trackers(pair):
+        aligned = tracker.track(seen, GUESS, field, TINY, np.random.default_rng(0)).c2w
+        for config, same in ((rendered, False), (astray, True)):
+            found = tracker.track(seen, GUESS, field, config, np.random.default_rng(0))
+            assert list(found.losses) == list(LOSS_NAMES)
+            assert np.isfinite(list(found.losses.values())).all()
+            np.testing.assert_allclose(found.c2w, aligned, atol=1e-6 if same else 1e-4)
+            assert same or not np.array_equal(found.c2w, aligned)
+
+
+def test_a_frame_without_depth_is_not_tracked(pair):
+    seen = look(TRUE, corner(), CAMERA)
+    blind = replace(seen, depth=np.zeros_like(seen.depth))
+    for tracker, field in trackers(pair):
+        found = tracker.track(blind, GUESS, field, TINY, np.random.default_rng(0))
+        assert (found.fit, found.losses) == (0.0, {})
+        np.testing.assert_array_equal(found.c2w, GUESS)
+
+
+@pytest.mark.parametrize("fus", [True, False])
+def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
+    """On the meta device no value can be read at all."""
+    for module in (fusion_gpu, gpu):
+        launch_nothing(monkeypatch, module)
+    meta = torch.device("meta")
+    config = replace(TINY, fus=fus, tracking=TrackingConfig(iterations=2, rays=60))
+    _, (tracker, field) = trackers(pair)
+    tracker = replace(tracker, observed=ObservedTable(meta))
+    field = TsdfField(field.layout, moved(field.params, meta))
+    blocks, _ = fusion_gpu.allocate(64, *LENGTHS, meta)
+    shown = DeviceFrame(torch.zeros(36, 48, 3, dtype=torch.uint8, device=meta), torch.zeros(36, 48, device=meta))
+    cells, order = grid_cells(shown, config.align.points, config), grid_cells(shown, config.tracking.rays, config)
+    numbers = torch.zeros(2 * cells + 60 * (3 + 7), device=meta)
+    corners, order = (torch.zeros(n, dtype=torch.int64, device=meta) for n in (20 if fus else 0, order))
+    start, rates = (torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((4, 4), (1, 6)))
+    given = shown.color, shown.depth, corners, order, start, rates, numbers
+    tracker._whole(field, blocks, config, *given)  # uploads the layout, once
+    with Forbidding():
+        (found,) = tracker._whole(field, blocks, config, *given)
+    assert found.shape == (HEADER + len(LOSS_NAMES),)

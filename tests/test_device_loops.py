@@ -23,7 +23,7 @@ from ecslam.pose_adam import pose_rates
 from ecslam.rays import upload
 from ecslam.rigid import rotation_angle_deg
 from ecslam.samples import uniform
-from ecslam.tracker import _descend, track_adam
+from ecslam.tracker import descend_rendered, track_adam
 
 CPU = torch.device("cpu")
 SETTINGS = ["mapping.rays=600", "mapping.iterations=6", "window.size=5", "field.log2_table_size=12"]
@@ -46,7 +46,7 @@ def keyframes(room, config, holes=0.0):
     for index in (0, 3, 6):
         frame = room[index]
         frame.depth[rng.random(frame.depth.shape) < holes] = 0
-        views.append(make_keyframe(frame, room.intrinsics, config, rng).pixels)
+        views.append(make_keyframe(frame, room.intrinsics, config).pixels)
         poses.append(frame.c2w_gt)
     return views, np.stack(poses)
 
@@ -212,7 +212,7 @@ def test_no_iteration_of_tracking_waits_for_the_gpu(gpu):
     rays += [torch.empty(30, dtype=dtype, device=gpu) for dtype in (torch.bool, torch.int64)]
     field = SimpleNamespace(layout=None, params=None)
     with Forbidding():
-        best, terms = _descend(field, NoKernels, None, 3, 0.5, c2w, rates, *rays)
+        best, terms = descend_rendered(field, NoKernels, None, 3, 0.5, c2w, rates, *rays)
     assert (best.shape, terms.shape) == ((1, 4, 4), (5,))
 
 

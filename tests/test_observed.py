@@ -1,9 +1,12 @@
 """Where the map has been observed."""
 
+import cv2
 import numpy as np
 import pytest
+import torch
 
 from ecslam.observed import ObservedVoxels
+from ecslam.observed_gpu import ObservedTable
 from ecslam.pixels import Pixels
 
 
@@ -17,7 +20,7 @@ def plane(count, depth=1.0):
 def test_pixels_are_known_where_the_wall_has_been_seen():
     observed, wall = ObservedVoxels(), plane(2000)
     points = wall.points()
-    observed.add(points[points[:, 0] < 0])
+    observed.add(points[points[:, 0] < 0], np.eye(4))
     known = observed.known(wall, np.eye(4), same_count=False)
     assert 900 < len(known) < 1200
     assert known.direction[:, 0].max() < 0.05
@@ -30,14 +33,38 @@ def test_pixels_are_known_where_the_wall_has_been_seen():
 def test_their_number_stays_where_a_recorded_loop_needs_it(same_count):
     observed, wall = ObservedVoxels(), plane(1000)
     points = wall.points()
-    observed.add(points[points[:, 0] < 0])
+    observed.add(points[points[:, 0] < 0], np.eye(4))
     known = observed.known(wall, np.eye(4), same_count)
     assert (len(known) == 1000) == same_count
     assert known.direction[:, 0].max() < 0.05
 
 
+def test_a_view_is_seen_from_its_camera():
+    observed, there = ObservedVoxels(), np.eye(4)
+    there[:3, 3] = (0, 0, 2)
+    observed.add(np.array([[0, 0, 1.02]], np.float32), there)
+    assert observed.contains(np.array([[0.01, 0.01, 3.03], [0, 0, 1.02]])).tolist() == [True, False]
+    assert observed.views == 1
+
+
+def test_a_table_on_a_device_knows_the_same_places():
+    voxels, table = ObservedVoxels(), ObservedTable(torch.device("cpu"))
+    rng, there = np.random.default_rng(0), np.eye(4)
+    there[:3, :3], there[:3, 3] = cv2.Rodrigues(np.array([0.3, -0.2, 0.9]))[0], (3.0, -2.0, 0.7)
+    for seen in (voxels, table):
+        for _ in range(2):
+            seen.add(plane(2000).points(), there)
+    points = rng.uniform(-6, 6, (200_000, 3))
+    points[:2000] = plane(2000).points().astype(np.float64) @ there[:3, :3].T + there[:3, 3]
+    known, found = voxels.contains(points), table.contains(torch.from_numpy(points)).numpy()
+    assert known.sum() > 100
+    assert found[known].all()
+    assert (found & ~known).mean() < 0.002
+    assert table.views == voxels.views == 2
+
+
 def test_pixels_without_depth_are_not_known():
     observed, holes = ObservedVoxels(), plane(500)
-    observed.add(holes.points())
+    observed.add(holes.points(), np.eye(4))
     holes.depth[::2] = 0
     assert (observed.known(holes, np.eye(4), same_count=False).depth > 0).all()

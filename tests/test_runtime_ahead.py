@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from ecslam import pixels
+from ecslam import keyframes, pixels
 from ecslam.config import Config, apply_settings, load_preset
 from ecslam.datasets import Prefetch, open_sequence
+from ecslam.keyframes import make_keyframe
 from ecslam.pixels import choose_pixels, feature_points, find_corners
 from ecslam.runtime import ahead
 from ecslam.runtime.ahead import preparation
@@ -18,26 +19,26 @@ FEW = apply_settings(Config(), ["feature_count=40"])
 @pytest.mark.parametrize(("preset", "found"), [("lite", range(8)), ("live", (0, 5))])
 def test_corners_are_found_ahead_for_the_frames_that_need_them(preset, found):
     config = load_preset(preset)
-    frames = [frame for _, frame in Prefetch(ROOM, prepare=preparation(lambda: config, "cpu"))]
+    frames = [frame for _, frame in Prefetch(ROOM, prepare=preparation(lambda: config, ROOM.intrinsics, "cpu"))]
     assert [frame.index for frame in frames if frame.corners is not None] == list(found)
 
 
 def test_without_fus_nobody_looks_for_corners():
     config = apply_settings(load_preset("lite"), ["fus=false"])
-    assert preparation(lambda: config, "cpu")(ROOM[0]).corners is None
+    assert preparation(lambda: config, ROOM.intrinsics, "cpu")(ROOM[0]).corners is None
 
 
 @pytest.mark.parametrize("limit", [1, 7, 40, 500])
 def test_the_first_corners_are_the_strongest_whoever_found_them(limit):
     frame = ROOM[0]
-    prepared = preparation(lambda: FEW, "cpu")(frame)
+    prepared = preparation(lambda: FEW, ROOM.intrinsics, "cpu")(frame)
     one, other = (feature_points(f, FEW, limit) for f in (frame, prepared))
     assert np.array_equal(one, other)
     assert np.array_equal(one, find_corners(frame.color, apply_settings(FEW, [f"feature_count={limit}"])).index[:40])
 
 
 def test_prepared_frames_are_not_searched_again(monkeypatch):
-    frame = preparation(lambda: FEW, "cpu")(ROOM[0])
+    frame = preparation(lambda: FEW, ROOM.intrinsics, "cpu")(ROOM[0])
     expected = choose_pixels(ROOM[0], ROOM.intrinsics, 200, FEW, np.random.default_rng(0))
     monkeypatch.setattr(pixels, "find_corners", lambda *_: pytest.fail("searched again"))
     found = choose_pixels(frame, ROOM.intrinsics, 200, FEW, np.random.default_rng(0))
@@ -49,15 +50,30 @@ def test_prepared_frames_are_not_searched_again(monkeypatch):
 )
 def test_corners_found_with_other_settings_are_looked_for_again(change):
     now = apply_settings(FEW, [change])
-    stale = preparation(lambda: FEW, "cpu")(ROOM[0])
+    stale = preparation(lambda: FEW, ROOM.intrinsics, "cpu")(ROOM[0])
     assert np.array_equal(feature_points(stale, now, 40), find_corners(ROOM[0].color, now).index)
     assert not np.array_equal(feature_points(stale, now, 40), stale.corners.index)
+
+
+def test_keyframes_are_made_ahead_for_the_frames_whose_turn_it_is(monkeypatch):
+    config = load_preset("live")
+    frames = [frame for _, frame in Prefetch(ROOM, prepare=preparation(lambda: config, ROOM.intrinsics, "cpu"))]
+    assert [frame.index for frame in frames if frame.keyframe is not None] == [0, 5]
+    expected = make_keyframe(ROOM[5], ROOM.intrinsics, config)
+    monkeypatch.setattr(keyframes, "choose_pixels", lambda *_, **__: pytest.fail("chosen again"))
+    assert np.array_equal(make_keyframe(frames[5], ROOM.intrinsics, config).record, expected.record)
+
+
+def test_a_keyframe_made_with_other_settings_is_made_again():
+    now = apply_settings(FEW, ["keyframe_share=0.1"])
+    frame = preparation(lambda: FEW, ROOM.intrinsics, "cpu")(ROOM[0])
+    assert len(make_keyframe(frame, ROOM.intrinsics, now)) == 2 * len(make_keyframe(frame, ROOM.intrinsics, FEW))
 
 
 def test_images_for_a_gpu_are_put_where_it_can_fetch_them(monkeypatch):
     monkeypatch.setattr(ahead, "pinned", lambda array: array.copy() + 1)
     frame = ROOM[0]
-    prepared = preparation(lambda: FEW, "cuda:0")(frame)
+    prepared = preparation(lambda: FEW, ROOM.intrinsics, "cuda:0")(frame)
     assert np.array_equal(prepared.color, frame.color + 1)
     assert np.array_equal(prepared.depth, frame.depth + 1)
 
@@ -65,4 +81,4 @@ def test_images_for_a_gpu_are_put_where_it_can_fetch_them(monkeypatch):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has it")
 def test_without_page_locked_memory_images_stay_where_they_are():
     frame = ROOM[0]
-    assert preparation(lambda: FEW, "cuda")(frame).color is frame.color
+    assert preparation(lambda: FEW, ROOM.intrinsics, "cuda")(frame).color is frame.color

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ecslam import slam
+from ecslam import tracker
 from ecslam.config import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.slam import Slam
@@ -33,7 +33,7 @@ def test_a_rendered_pose_that_the_volume_contradicts_is_not_taken(monkeypatch, t
     engine.step(room[0])
     wrong = np.array(room[1].c2w_gt)
     wrong[:3, 3] += 0.01
-    monkeypatch.setattr(slam, "track_adam", lambda *_: (wrong, {}))
+    monkeypatch.setattr(tracker, "track_adam", lambda *_: (wrong, {}))
     engine.step(room[1])
     off = np.linalg.norm(engine.trajectory[1][:3, 3] - room[1].c2w_gt[:3, 3])
     assert off < 0.005 if to == "fused" else off == pytest.approx(0.01 * 3**0.5)

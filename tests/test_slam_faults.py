@@ -11,6 +11,7 @@ from ecslam.config import Config, apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.messages import StepReport
 from ecslam.slam import Slam
+from ecslam.tracker import HostTracker
 from ecslam.types import Frame
 
 ROOM = open_sequence("synthetic/studio?size=160x120")
@@ -95,14 +96,14 @@ def test_a_kidnapped_camera_is_noticed_and_found_again():
 def test_nan_in_a_tracked_pose_is_not_taken(monkeypatch):
     slam = engine()
     walk(slam, list(range(12)))
-    real, calls = Slam._track_from, []
+    real, calls = HostTracker.track, []
 
     def track(self, *args):
         found = real(self, *args)
         calls.append(1)
         return replace(found, c2w=np.full((4, 4), np.nan)) if len(calls) == 2 else found
 
-    monkeypatch.setattr(Slam, "_track_from", track)
+    monkeypatch.setattr(HostTracker, "track", track)
     reports = walk(slam, list(range(12, 20)))
     assert np.isfinite(slam.trajectory.poses()).all()
     assert reports[1].note == "recovered"

@@ -8,21 +8,26 @@ from dataclasses import replace
 import numpy as np
 
 from ..config import Config
-from ..types import Frame
+from ..types import Frame, Intrinsics
 
 
-def preparation(config: Callable[[], Config], device: str) -> Callable[[Frame], Frame]:
-    """Find the corners of frames that will need them, and put images for a GPU where it can fetch them by itself.
+def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -> Callable[[Frame], Frame]:
+    """Find the corners of frames that will need them, make keyframes of those whose turn it will be, and put images for
+    a GPU where it can fetch them by itself.
 
     config: asked for every frame. What is missing, or was found with other settings, is made good when it is needed.
     """
 
     def prepare(frame: Frame) -> Frame:
-        from ..pixels import find_corners  # torch is not imported at the start
+        from ..keyframes import prepared  # torch is not imported at the start
+        from ..pixels import find_corners
 
         now = config()
-        if now.fus and (now.tracking.iterations > 0 or frame.index % now.keyframe_every == 0):
+        turn = frame.index % now.keyframe_every == 0
+        if now.fus and (now.tracking.iterations > 0 or turn):
             frame = replace(frame, corners=find_corners(frame.color, now))
+        if turn:
+            frame = prepared(frame, camera, now)
         if device.startswith("cuda"):
             frame = replace(frame, color=pinned(frame.color), depth=pinned(frame.depth))
         return frame

@@ -197,7 +197,7 @@ class Engine:
             folder = RunFolder.reopen(plan.out, resumed.frame, self._not_saved)
         run = Run(plan, folder, self._emit, self._make, self._checkpoint_every, resumed)
         coming = range(run.tally.position, len(plan.sequence))
-        prepare = preparation(lambda: run.config, plan.device)
+        prepare = preparation(lambda: run.config, plan.sequence.intrinsics, plan.device)
         self._ahead = datasets.Prefetch(plan.sequence, coming, prepare=prepare)
         return run
 
