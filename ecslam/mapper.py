@@ -182,7 +182,7 @@ class Mapper:
     ) -> tuple[Tensor, Tensor]:
         """One iteration for each share in ``left`` of the learning rates: the poses and the loss terms [I, 5]."""
         m, field = job.config.mapping, self.field
-        poses, losses = PoseAdam(c2w, rates), []
+        poses, losses = PoseAdam(c2w, rates, kernels=self.kernels), []
         for iteration, share in enumerate(left):
             interrupt()
             rays, now = draw(iteration, poses.c2w), poses.c2w.float()

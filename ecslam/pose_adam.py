@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from . import se3
+from .kernels import Backend, reference
 
 BETA2, EPSILON = 0.999, 1e-8
 
@@ -21,21 +21,26 @@ class PoseAdam:
 
     momentum: Adam's first decay. about: float64 [P, 3], in camera coordinates, what each camera turns about; without,
     itself. A camera that turns about itself sees nearly what it sees when it moves sideways, and Adam, which scales
-    each number alone, is slow to tell the two apart; about the middle of what it sees they differ.
+    each number alone, is slow to tell the two apart; about the middle of what it sees they differ. kernels: who
+    computes.
     """
 
-    def __init__(self, c2w: Tensor, rates: Tensor, momentum: float = 0.9, about: Tensor | None = None) -> None:
-        self.c2w, self._rates, self._momentum, self._about = c2w, rates, momentum, about
+    def __init__(
+        self,
+        c2w: Tensor,
+        rates: Tensor,
+        momentum: float = 0.9,
+        about: Tensor | None = None,
+        kernels: Backend = reference,
+    ) -> None:
+        self.c2w, self._rates, self._decays, self._about = c2w, rates, (momentum, BETA2), about
         self._mean, self._square = torch.zeros_like(rates), torch.zeros_like(rates)
-        self._count = 0
+        self._count, self._kernels = 0, kernels
 
     def step(self, d_c2w: Tensor, share: float | Tensor = 1.0) -> None:
         """One update from gradients [P, 3, 4] at ``share`` of the learning rates."""
-        gradient = se3.tangent_gradient(self.c2w, d_c2w.to(self.c2w.dtype), self._about)
         self._count += 1
-        self._mean.mul_(self._momentum).add_(gradient, alpha=1 - self._momentum)
-        self._square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-        mean = self._mean / (1 - self._momentum**self._count)
-        square = self._square / (1 - BETA2**self._count)
-        move = -share * self._rates * mean / (square.sqrt() + EPSILON)
-        self.c2w = se3.retract(self.c2w, move, self._about)
+        moments, rates = (self._mean, self._square), share * self._rates
+        self.c2w = self._kernels.pose_step(
+            self.c2w, d_c2w, *moments, rates, self._about, self._decays, EPSILON, self._count
+        )

@@ -124,7 +124,7 @@ def descend_rendered(
 ) -> tuple[Tensor, Tensor]:
     """The iterations, never waiting for the device: the best iterate [1, 4, 4] and the terms [5] there."""
     batch = RayBatch(*rays)
-    optimiser, best = PoseAdam(c2w, rates, momentum, view_centre(batch)[None]), c2w
+    optimiser, best = PoseAdam(c2w, rates, momentum, view_centre(batch)[None], kernels), c2w
     best_terms = torch.full((len(LOSS_NAMES),), torch.inf, device=c2w.device)
     for _ in range(iterations):
         pose = optimiser.c2w.float()

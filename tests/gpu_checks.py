@@ -23,11 +23,13 @@ from kernel_cases import (
     make_rays,
     relative_rms,
 )
-from on_gpu import INTERPRETED, run
+from on_gpu import DEVICE, INTERPRETED, moved, run
 
 from ecslam.config import FieldConfig
 from ecslam.field import grow_field
 from ecslam.kernels import FieldParams, gpu, reference
+from ecslam.kernels.poses_gpu import pose_step
+from ecslam.pose_adam import BETA2, EPSILON, PoseAdam
 
 torch.set_num_threads(1)
 SIZES = (0, 1, 63, 64, 65, 300)
@@ -211,3 +213,23 @@ def test_no_step_waits_for_the_gpu(monkeypatch, want_params, want_poses):
     with Forbidding():
         found = gpu.step(field.layout, params, c2w, rays, WEIGHTS, mine, want_poses)
     assert found.losses.device.type == "meta"
+
+
+@pytest.mark.parametrize("poses", [1, 5, 33])
+@pytest.mark.parametrize("about", [True, False])
+def test_a_step_of_the_poses(poses, about):
+    g = torch.Generator().manual_seed(0)
+    c2w, rates = make_poses(poses, g).double(), torch.rand(poses, 6, generator=g).double() * 0.01
+    rates[0] = 0
+    rates[-1] = 1e-9
+    centre = torch.randn(poses, 3, generator=g).double() if about else None
+    expected, found = PoseAdam(c2w, rates, 0.5, centre), c2w
+    mean, square = torch.zeros(poses, 6).double(), torch.zeros(poses, 6).double()
+    there = [moved(t, DEVICE) for t in (found, mean, square, rates, centre)]
+    found, mean, square, rates, centre = there
+    for count in range(1, 4):
+        gradient = torch.randn(poses, 3, 4, generator=g)
+        expected.step(gradient)
+        found = pose_step(found, gradient.to(DEVICE), mean, square, rates, centre, (0.5, BETA2), EPSILON, count)
+    torch.testing.assert_close(found.cpu(), expected.c2w, rtol=0, atol=1e-8)
+    assert poses == 1 or (found.cpu() - c2w).abs().max() > 0.01

@@ -54,6 +54,9 @@ def launch_the_map(variants):
     gpu.render(layout, params, c2w, rays)
     gpu.step(layout, params, c2w, rays, WEIGHTS, blank(params), True)
     gpu.normal_equations(layout, params, c2w[0], points, points[:, 0].contiguous(), ALIGN)
+    poses = torch.eye(4).double().repeat(30, 1, 1)
+    moments = [torch.zeros(30, 6).double() for _ in range(3)]
+    gpu.pose_step(poses, torch.zeros(30, 3, 4), *moments, torch.zeros(30, 3).double(), (0.5, 0.9), 1e-8, 1)
     if variants:
         gpu.values(layout, params, points)
         gpu.step(layout, params, c2w, rays, WEIGHTS, None, True)

@@ -13,7 +13,7 @@ from ecslam.config import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.draws import device_draw, shares
 from ecslam.field import create_field
-from ecslam.kernels import FieldParams, StepResult
+from ecslam.kernels import FieldParams, StepResult, reference
 from ecslam.kernels.graphs import Recorder
 from ecslam.keyframes import make_keyframe
 from ecslam.mapper import Job, Mapper
@@ -172,6 +172,8 @@ class NoKernels:
     @staticmethod
     def render(layout, params, c2w, rays):
         return rays.color, rays.depth, torch.zeros_like(rays.z)
+
+    pose_step = staticmethod(reference.pose_step)
 
 
 @pytest.fixture

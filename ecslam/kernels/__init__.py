@@ -1,4 +1,4 @@
-"""The kernel seam: five pure functions, one signature, three back ends.
+"""The kernel seam: six functions, one signature, three back ends.
 
 ``reference`` (torch, readable, any device), ``cpu`` (numba) and ``gpu`` (Triton). The device picks the back end;
 ``ECSLAM_KERNELS=reference`` or ``with kernels.use("reference")`` overrides. An explicit choice that cannot run raises
@@ -89,6 +89,21 @@ class Backend(Protocol):
         settings: AlignSettings,
     ) -> NormalEquations:
         """Sums for one Gauss-Newton step."""
+        ...
+
+    def pose_step(
+        self,
+        c2w: Tensor,
+        d_c2w: Tensor,
+        mean: Tensor,
+        square: Tensor,
+        rates: Tensor,
+        about: Tensor | None,
+        decays: tuple[float, float],
+        epsilon: float,
+        count: int,
+    ) -> Tensor:
+        """Poses [P, 4, 4] after one step of Adam."""
         ...
 
 

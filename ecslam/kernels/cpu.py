@@ -35,6 +35,7 @@ from ._cpu_work import (
     table_worker,
     values_worker,
 )
+from .reference import pose_step as pose_step
 from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
 
 drop_stale(Path(__file__).parent, step_worker.stats.cache_path, "_cpu_*")

@@ -26,6 +26,7 @@ from ._gpu_device import beside, processors
 from ._gpu_field import Field, Shape
 from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, values_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
+from .poses_gpu import pose_step as pose_step
 
 BLOCK = 32  # points; the way back already spills registers, and with 64 far more (ptxas, compute capability 9.0)
 RAY_ELEMENTS = 512  # padded samples that one program renders

@@ -1,0 +1,33 @@
+"""Steps of Adam for rigid poses on a GPU."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ._gpu_device import beside
+from ._gpu_poses import pose_kernel
+
+BLOCK = 32
+
+
+def pose_step(
+    c2w: Tensor,
+    d_c2w: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rates: Tensor,
+    about: Tensor | None,
+    decays: tuple[float, float],
+    epsilon: float,
+    count: int,
+) -> Tensor:
+    """See ``reference.pose_step``. Never waits for the device."""
+    moved, poses = torch.empty_like(c2w), len(c2w)
+    with beside(c2w):
+        pose_kernel[(-(-poses // BLOCK),)](
+            c2w, d_c2w, mean, square, rates, rates if about is None else about, moved, poses,
+            *decays, *(1 - decay**count for decay in decays), epsilon, turns_about=about is not None, block=BLOCK,
+            num_warps=1,
+        )  # fmt: skip
+    return moved
