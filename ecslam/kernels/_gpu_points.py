@@ -168,68 +168,54 @@ def values_kernel(
         tl.store(rgb + 3 * i + k, out[1 + k], live)
 
 
-@triton.jit
-def load_gradients(d_sdf, d_rgb, i, live):
-    """The gradients of TSDF and of the three colours before their sigmoid [P] each."""
-    at = d_rgb + 3 * i
-    red, green, blue = tl.load(at, live, 0.0), tl.load(at + 1, live, 0.0), tl.load(at + 2, live, 0.0)
-    return tl.load(d_sdf + i, live, 0.0), red, green, blue
-
-
-@triton.jit(do_not_specialize=["total"])
-def weights_kernel(
-    field, placed, total, d_sdf, d_rgb, features_at, hidden_at, into, blocks, shape: tl.constexpr, block: tl.constexpr
-):
-    """From the gradients of TSDF [N] and of colour before its sigmoid [N, 3] to the decoders.
-
-    A program takes every n-th block and keeps its share of the gradient in registers until the end.
-    """
-    by_feature = tl.full([WIDE, 2 * shape.width], 0, tl.float32)
-    by_blob = tl.full([WIDE, shape.blobs], 0, tl.float32)
-    to_sdf, to_red = tl.full([WIDE], 0, tl.float32), tl.full([WIDE], 0, tl.float32)
-    to_green, to_blue = tl.full([WIDE], 0, tl.float32), tl.full([WIDE], 0, tl.float32)
-    for number in tl.range(tl.program_id(0), blocks, tl.num_programs(0), num_stages=1):
-        i = number * block + tl.arange(0, block)
-        live = i < total
-        where, there = hidden_places(i, live)
-        hidden = tl.load(hidden_at + where, there, 0.0)
-        d_out = load_gradients(d_sdf, d_rgb, i, live)
-        on = tl.maximum(hidden, 0.0)
-        to_sdf += tl.sum(on * d_out[0][:, None], 0)
-        to_red += tl.sum(on * d_out[1][:, None], 0)
-        to_green += tl.sum(on * d_out[2][:, None], 0)
-        to_blue += tl.sum(on * d_out[3][:, None], 0)
-        across = tl.trans(into_hidden(field, hidden, d_out))
-        where, there = feature_places(i, live, total, shape)
-        by_feature += product(across, tl.trans(tl.load(features_at + where, there, 0.0)))
-        by_blob += product(across, one_blob(load_placed(placed, 2, i, live, total), shape)[0])
-    add_rows(into.w_in, feature_rows(shape), tl.trans(by_feature))
-    add_rows(into.w_in, blob_rows(shape), tl.trans(by_blob))
-    add_reader(into, 0, to_sdf)
-    add_reader(into, 1, to_red)
-    add_reader(into, 2, to_green)
-    add_reader(into, 3, to_blue)
-
-
 @triton.jit(do_not_specialize=["total"])
 def decoders_kernel(
-    field, placed, total, d_sdf, d_rgb, features_at, hidden_at, d_world, want_poses: tl.constexpr,
-    shape: tl.constexpr, block: tl.constexpr,
+    field, placed, total, d_sdf, d_rgb, hidden_at, d_features_at, d_world, into, want_params: tl.constexpr,
+    want_poses: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
-    """From the gradients of TSDF [N] and of colour before its sigmoid [N, 3] to the grid features, which are
-    overwritten by their gradients, and to the position through the one-blob part, d_world [N, 3]."""
+    """From the gradients of TSDF [N] and of colour before its sigmoid [N, 3] to the decoders' last layer, to the hidden
+    units, which are overwritten by their gradients (both with ``want_params``), to the grid features [2 L, N] and, with
+    ``want_poses``, to the position through the one-blob part, d_world [N, 3]."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
     where, there = hidden_places(i, live)
     hidden = tl.load(hidden_at + where, there, 0.0)
-    d_hidden = into_hidden(field, hidden, load_gradients(d_sdf, d_rgb, i, live))
+    to_sdf, to_red = tl.load(d_sdf + i, live, 0.0), tl.load(d_rgb + 3 * i, live, 0.0)
+    to_green, to_blue = tl.load(d_rgb + 3 * i + 1, live, 0.0), tl.load(d_rgb + 3 * i + 2, live, 0.0)
+    d_out = to_sdf, to_red, to_green, to_blue
+    d_hidden = into_hidden(field, hidden, d_out)
+    if want_params:
+        tl.store(hidden_at + where, d_hidden, there)
+        for output in tl.static_range(4):
+            add_reader(into, output, tl.sum(tl.maximum(hidden, 0.0) * d_out[output][:, None], 0))
     where, there = feature_places(i, live, total, shape)
-    tl.store(features_at + where, tl.trans(into_features(field, d_hidden, shape)), there)
+    tl.store(d_features_at + where, tl.trans(into_features(field, d_hidden, shape)), there)
     if want_poses:
         _, slope = one_blob(load_placed(placed, 2, i, live, total), shape)
         gradient = through_blob(field, d_hidden, slope, shape)
         for axis in tl.static_range(3):
             tl.store(d_world + 3 * i + axis, gradient[axis], live)
+
+
+@triton.jit(do_not_specialize=["total"])
+def weights_kernel(placed, total, features_at, d_hidden_at, into, blocks, shape: tl.constexpr, block: tl.constexpr):
+    """From the gradients of the hidden units [N, 64] to the decoders' first layer.
+
+    A program takes every n-th block and keeps its share of the gradient in registers until the end.
+    """
+    by_feature = tl.full([2 * shape.width, WIDE], 0, tl.float32)
+    by_blob = tl.full([shape.blobs, WIDE], 0, tl.float32)
+    for number in tl.range(tl.program_id(0), blocks, tl.num_programs(0), num_stages=1):
+        i = number * block + tl.arange(0, block)
+        live = i < total
+        where, there = hidden_places(i, live)
+        d_hidden = tl.load(d_hidden_at + where, there, 0.0)
+        where, there = feature_places(i, live, total, shape)
+        by_feature += product(tl.load(features_at + where, there, 0.0), d_hidden)
+        blob, _ = one_blob(load_placed(placed, 2, i, live, total), shape)
+        by_blob += product(tl.trans(blob), d_hidden)
+    add_rows(into.w_in, feature_rows(shape), by_feature)
+    add_rows(into.w_in, blob_rows(shape), by_blob)
 
 
 @triton.jit

@@ -1,7 +1,7 @@
 """The fused GPU back end (Triton): kernels over blocks of points and of rays.
 
 A step is six launches, seven if the map learns: clear; place; encode and decode; render, compare and differentiate;
-weights back; decoders back; grid back. In between lie places, TSDF, colour, hidden units and the grid's features, later
+decoders back; weights back; grid back. In between lie places, TSDF, colour, hidden units and the grid's features, and
 their gradients, which a GPU's cache holds. No launch waits for the host, sizes depend on shapes alone and memory comes
 from torch, so a CUDA graph can record whole loops (``graphs``). Sums are taken by atomics in varying order: results
 vary in their last digits.
@@ -194,8 +194,8 @@ def _step(
     """Add to ``losses``, to ``into`` and to ``d_c2w``, where they are wanted."""
     field, beta, shape = _field(layout, params), _flat(params.beta), _shape(layout)
     total, placed = points.total, _place(layout, field, points, True)
-    kept = beta.new_empty(2 * layout.levels, total), beta.new_empty(total, HIDDEN)
-    sdf, rgb = _evaluate(layout, field, placed, kept)
+    features, hidden = beta.new_empty(2 * layout.levels, total), beta.new_empty(total, HIDDEN)
+    sdf, rgb = _evaluate(layout, field, placed, (features, hidden))
     grid, sizes = _ray_grid(targets.rays, targets.samples)
     numbers = tuple(float(getattr(weights, name)) for name in Weights.__dataclass_fields__)
     d_beta = beta if into is None else into.beta
@@ -203,21 +203,21 @@ def _step(
     if into is None and d_c2w is None:
         return
     sink = Into(*(getattr(into or params, name) for name in Into._fields))
+    wanted = {"want_params": into is not None, "want_poses": d_c2w is not None}
+    d_features, d_world = torch.empty_like(features), beta.new_empty(total, 3)
+    decoders_kernel[(_blocks(total, DECODERS_BLOCK),)](
+        field, placed, total, sdf, rgb, hidden, d_features, d_world, sink,
+        **wanted, shape=shape, block=DECODERS_BLOCK, num_warps=DECODERS_WARPS,
+    )  # fmt: skip
     if into is not None:
         blocks = _blocks(total, WEIGHTS_BLOCK)
         weights_kernel[(min(blocks, PROGRAMS_A_PROCESSOR * processors(losses.device)),)](
-            field, placed, total, sdf, rgb, *kept, sink, blocks,
-            shape=shape, block=WEIGHTS_BLOCK, num_warps=WEIGHTS_WARPS,
-        )  # fmt: skip
-    want_poses, d_world = d_c2w is not None, beta.new_empty(total, 3)
-    decoders_kernel[(_blocks(total, DECODERS_BLOCK),)](
-        field, placed, total, sdf, rgb, *kept, d_world,
-        want_poses=want_poses, shape=shape, block=DECODERS_BLOCK, num_warps=DECODERS_WARPS,
-    )  # fmt: skip
+            placed, total, features, hidden, sink, blocks, shape=shape, block=WEIGHTS_BLOCK, num_warps=WEIGHTS_WARPS
+        )
     unused = losses
     grid_kernel[(_blocks(total, GRID_BLOCK),)](
-        field, points, placed, total, kept[0], d_world, sink, unused if d_c2w is None else d_c2w,
-        want_params=into is not None, want_poses=want_poses, shape=shape, block=GRID_BLOCK, num_warps=GRID_WARPS,
+        field, points, placed, total, d_features, d_world, sink, unused if d_c2w is None else d_c2w,
+        **wanted, shape=shape, block=GRID_BLOCK, num_warps=GRID_WARPS,
     )  # fmt: skip
 
 
