@@ -44,7 +44,7 @@ FIELDS = {
 @pytest.fixture(autouse=True)
 def large_blocks(monkeypatch):
     if INTERPRETED:
-        monkeypatch.setattr(gpu, "BLOCK", 64)
+        monkeypatch.setattr(gpu, "GRID_BLOCK", 64)
 
 
 def assert_close(found, expected):
@@ -96,8 +96,8 @@ def test_step_and_render(count):
 
 def test_the_block_that_runs_on_a_gpu(monkeypatch):
     monkeypatch.undo()
-    assert gpu.BLOCK < 64
-    assert_step(make_field(), *make_rays(gpu.BLOCK + 1, 2))
+    assert gpu.GRID_BLOCK < 64
+    assert_step(make_field(), *make_rays(gpu.GRID_BLOCK + 1, 2))
 
 
 @pytest.mark.parametrize(("count", "samples"), [(3, 43), (70, 1)])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from ._gpu_decoders import OUTPUTS, decode, into_features, into_hidden, layer_one, through_blob
-from ._gpu_field import gather, place, pull
+from ._gpu_decoders import decode, into_features, into_hidden, layer_one, through_blob
+from ._gpu_field import gather, on_box, one_blob, place, pull
 from ._gpu_points import moved, triple
 
 RED, GREEN, BLUE = tl.constexpr(0.299), tl.constexpr(0.587), tl.constexpr(0.114)
@@ -14,35 +14,38 @@ SUMS = 67  # [8, 8] products of (jacobian, residual, 0), then cost, used, inlier
 
 
 @triton.jit
-def into_world(field, hidden, d_out, at, fraction, phase, inside, live, shape: tl.constexpr):
+def into_world(field, hidden, d_out, at, fraction, slope, inside, live, shape: tl.constexpr):
     """Gradient by the world position, per metre (x, y, z: [P] each), from those of the outputs before their sigmoid."""
     d_hidden = into_hidden(field, hidden, d_out)
-    d_even, d_odd = into_features(field, d_hidden, shape)
+    d_features = into_features(field, d_hidden, shape)
+    d_even, d_odd = tl.split(tl.reshape(d_features, [d_features.shape[0], shape.width, 2]))
     gx, gy, gz = pull(field, at, fraction, d_even, d_odd, live, shape)
-    gx += through_blob(field, d_hidden, phase, 0, shape)
-    gy += through_blob(field, d_hidden, phase, 1, shape)
-    gz += through_blob(field, d_hidden, phase, 2, shape)
-    return gx * inside[0], gy * inside[1], gz * inside[2]
+    bx, by, bz = through_blob(field, d_hidden, slope, shape)
+    return (gx + bx) * inside[0], (gy + by) * inside[1], (gz + bz) * inside[2]
 
 
 @triton.jit
 def both_gradients(field, world, live, colour: tl.constexpr, shape: tl.constexpr):
     """TSDF and its gradient, luminance and (if ``colour``, else anything) its gradient, at world positions."""
-    at, fraction, phase, inside = place(field, world, shape)
-    hidden = layer_one(field, gather(field, at, fraction, live, shape), phase, shape)
-    out = decode(field, hidden)
-    output = tl.arange(0, OUTPUTS)[None, :]
-    share = tl.where(output == 1, RED, tl.where(output == 2, GREEN, tl.where(output == 3, BLUE, 0.0)))
-    sdf, luminance = tl.sum(tl.where(output == 0, out, 0.0), 1), tl.sum(share * out, 1)
-    one = tl.where(output == 0, 1.0, tl.zeros_like(out))
-    x, y, z = tl.zeros_like(sdf), tl.zeros_like(sdf), tl.zeros_like(sdf)
-    sdf_x, sdf_y, sdf_z = x, y, z
+    x, y, z = on_box(field, world[0], 0, shape), on_box(field, world[1], 1, shape), on_box(field, world[2], 2, shape)
+    at, fraction = place(field, (x[0], y[0], z[0]), (x[1], y[1], z[1]), shape)
+    inside = x[3], y[3], z[3]
+    blob, slope = one_blob((x[2], y[2], z[2]), shape)
+    even, odd = gather(field, at, fraction, live, shape)
+    hidden = layer_one(field, tl.interleave(even, odd), blob, shape)
+    sdf, red, green, blue = decode(field, hidden)
+    luminance = RED * red + GREEN * green + BLUE * blue
+    one, none = tl.full(sdf.shape, 1, tl.float32), tl.zeros_like(sdf)
+    gx, gy, gz = tl.zeros_like(sdf), tl.zeros_like(sdf), tl.zeros_like(sdf)
+    sdf_x, sdf_y, sdf_z = gx, gy, gz
     # A loop that stays a loop: written out, all its gathers would be merged and their results kept in registers.
     for k in range(2 if colour else 1):
-        d_out = tl.where(k == 0, one, share * out * (1 - out))
-        x, y, z = into_world(field, hidden, d_out, at, fraction, phase, inside, live, shape)
-        sdf_x, sdf_y, sdf_z = tl.where(k == 0, x, sdf_x), tl.where(k == 0, y, sdf_y), tl.where(k == 0, z, sdf_z)
-    return sdf, (sdf_x, sdf_y, sdf_z), luminance, (x, y, z)
+        d_red, d_green, d_blue = RED * red * (1 - red), GREEN * green * (1 - green), BLUE * blue * (1 - blue)
+        d_color = tl.where(k == 0, none, d_red), tl.where(k == 0, none, d_green), tl.where(k == 0, none, d_blue)
+        d_out = tl.where(k == 0, one, none), d_color[0], d_color[1], d_color[2]
+        gx, gy, gz = into_world(field, hidden, d_out, at, fraction, slope, inside, live, shape)
+        sdf_x, sdf_y, sdf_z = tl.where(k == 0, gx, sdf_x), tl.where(k == 0, gy, sdf_y), tl.where(k == 0, gz, sdf_z)
+    return sdf, (sdf_x, sdf_y, sdf_z), luminance, (gx, gy, gz)
 
 
 @triton.jit

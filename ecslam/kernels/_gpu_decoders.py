@@ -1,7 +1,7 @@
 """The two decoders as Triton code: both in one set of small matrix products, and the way back.
 
 Columns 0 to 31 of the hidden layer are the TSDF decoder's, 32 to 63 the colour decoder's. Products run as three TF32
-ones: tensor cores at about float32 precision.
+ones: tensor cores at about float32 precision. The last layer is too narrow for them and is summed plainly.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from ._gpu_field import one_blob
+from ._gpu_field import axis_of
 
 WIDE = tl.constexpr(64)
 HALF = tl.constexpr(32)
-OUTPUTS = tl.constexpr(16)  # four, and the least that a matrix product takes
 
 
 @triton.jit
@@ -23,17 +22,17 @@ def product(a, b):
 
 
 @triton.jit
-def feature_rows(odd: tl.constexpr, shape: tl.constexpr):
-    """Rows of w_in that the even or the odd features meet [width], and which exist."""
-    level = tl.arange(0, shape.width)
-    return 2 * level + odd, level < shape.levels
+def feature_rows(shape: tl.constexpr):
+    """Rows of w_in that the grid features meet [2 width], and which exist."""
+    row = tl.arange(0, 2 * shape.width)
+    return row, row < 2 * shape.levels
 
 
 @triton.jit
-def blob_rows(axis: tl.constexpr, shape: tl.constexpr):
-    """Rows of w_in that one axis' bins meet [blobs], and which exist."""
-    bins = tl.arange(0, shape.blobs)
-    return 2 * shape.levels + axis * shape.bins + bins, bins < shape.bins
+def blob_rows(shape: tl.constexpr):
+    """Rows of w_in that the one-blob values meet [blobs], and which exist."""
+    row = tl.arange(0, shape.blobs)
+    return 2 * shape.levels + row, row < 3 * shape.bins
 
 
 @triton.jit
@@ -52,63 +51,66 @@ def add_rows(into, rows, values):
 
 
 @triton.jit
-def layer_one(field, features, phase, shape: tl.constexpr):
-    """The hidden units of both decoders before the ReLU [P, 64], from (even, odd) features and one-blob phases."""
-    total = product(features[0], weights(field.w_in, feature_rows(0, shape)))
-    total += product(features[1], weights(field.w_in, feature_rows(1, shape)))
-    for axis in tl.static_range(3):
-        total += product(one_blob(phase[axis], shape)[0], weights(field.w_in, blob_rows(axis, shape)))
-    return total
+def layer_one(field, features, blob, shape: tl.constexpr):
+    """The hidden units of both decoders before the ReLU [P, 64], from grid features and one-blob values."""
+    from_grid = product(features, weights(field.w_in, feature_rows(shape)))
+    return from_grid + product(blob, weights(field.w_in, blob_rows(shape)))
 
 
 @triton.jit
-def readers(field):
-    """Weights [16, 64] from the hidden units to the outputs: row 0 the TSDF, 1 to 3 the colours, the rest zero."""
-    output, unit = tl.arange(0, OUTPUTS)[:, None], tl.arange(0, WIDE)[None, :]
-    to_sdf = tl.load(field.w_sdf + unit + 0 * output, (output == 0) & (unit < HALF), 0.0)
-    to_rgb = tl.load(field.w_rgb + 3 * (unit - HALF) + output - 1, is_colour(output) & (unit >= HALF), 0.0)
-    return to_sdf + to_rgb
+def reader(field, output: tl.constexpr):
+    """Where the weights [64] from the hidden units to one output lie (0: TSDF, 1 to 3: colours), and which exist."""
+    unit = tl.arange(0, WIDE)
+    if output == 0:
+        return field.w_sdf + unit, unit < HALF
+    else:
+        return field.w_rgb + 3 * (unit - HALF) + (output - 1), unit >= HALF
 
 
 @triton.jit
-def is_colour(output):
-    """Which outputs are colours."""
-    return (output > 0) & (output < 4)
+def read(field, output: tl.constexpr):
+    """The weights [1, 64] from the hidden units to one output, zero for those of the other decoder."""
+    at, there = reader(field, output)
+    return tl.load(at, there, 0.0)[None, :]
 
 
 @triton.jit
-def add_readers(into, values):
-    """Add [16, 64] to the gradients of w_sdf and w_rgb."""
-    output, unit = tl.arange(0, OUTPUTS)[:, None], tl.arange(0, WIDE)[None, :]
-    tl.atomic_add(into.w_sdf + unit + 0 * output, values, (output == 0) & (unit < HALF), sem="relaxed")
-    to_rgb = into.w_rgb + 3 * (unit - HALF) + output - 1
-    tl.atomic_add(to_rgb, values, is_colour(output) & (unit >= HALF), sem="relaxed")
+def add_reader(into, output: tl.constexpr, values):
+    """Add [64] to the gradient of one output's weights."""
+    at, there = reader(into, output)
+    tl.atomic_add(at, values, there, sem="relaxed")
 
 
 @triton.jit
 def decode(field, hidden):
-    """The outputs [P, 16]: TSDF, the three colours, nothing."""
-    out = product(tl.maximum(hidden, 0.0), tl.trans(readers(field)))
-    return tl.where(is_colour(tl.arange(0, OUTPUTS)[None, :]), tl.sigmoid(out), out)
+    """TSDF, red, green, blue [P] each."""
+    on = tl.maximum(hidden, 0.0)
+    red, green = tl.sum(on * read(field, 1), 1), tl.sum(on * read(field, 2), 1)
+    blue = tl.sum(on * read(field, 3), 1)
+    return tl.sum(on * read(field, 0), 1), tl.sigmoid(red), tl.sigmoid(green), tl.sigmoid(blue)
 
 
 @triton.jit
 def into_hidden(field, hidden, d_out):
-    """Gradient before the ReLU [P, 64] from that of the outputs before their sigmoid [P, 16]."""
-    return tl.where(hidden > 0, product(d_out, readers(field)), 0.0)
+    """Gradient before the ReLU [P, 64] from those of TSDF and of the colours before their sigmoid [P] each."""
+    d_hidden = d_out[0][:, None] * read(field, 0) + d_out[1][:, None] * read(field, 1)
+    d_hidden += d_out[2][:, None] * read(field, 2) + d_out[3][:, None] * read(field, 3)
+    return tl.where(hidden > 0, d_hidden, 0.0)
 
 
 @triton.jit
 def into_features(field, d_hidden, shape: tl.constexpr):
-    """Gradients of the even and of the odd features [P, width]."""
-    d_even = product(d_hidden, tl.trans(weights(field.w_in, feature_rows(0, shape))))
-    d_odd = product(d_hidden, tl.trans(weights(field.w_in, feature_rows(1, shape))))
-    return d_even, d_odd
+    """Gradient of the grid features [P, 2 width]."""
+    return product(d_hidden, tl.trans(weights(field.w_in, feature_rows(shape))))
 
 
 @triton.jit
-def through_blob(field, d_hidden, phase, axis: tl.constexpr, shape: tl.constexpr):
-    """Gradient by one world coordinate through its one-blob values, per metre [P]."""
-    d_blob = product(d_hidden, tl.trans(weights(field.w_in, blob_rows(axis, shape))))
-    by_phase = tl.sum(one_blob(phase[axis], shape)[1] * d_blob, 1)
-    return by_phase * tl.load(field.geometry + 6 + axis).to(tl.float32) * shape.bins
+def through_blob(field, d_hidden, slope, shape: tl.constexpr):
+    """Gradient by the world position through the one-blob values, per metre (x, y, z: [P] each). slope: derivatives of
+    the values by their phases."""
+    by_phase = slope * product(d_hidden, tl.trans(weights(field.w_in, blob_rows(shape))))
+    axis, at = axis_of(shape)[None, :], field.geometry + 6
+    x = tl.sum(tl.where(axis == 0, by_phase, 0.0), 1) * (shape.bins * tl.load(at).to(tl.float32))
+    y = tl.sum(tl.where(axis == 1, by_phase, 0.0), 1) * (shape.bins * tl.load(at + 1).to(tl.float32))
+    z = tl.sum(tl.where(axis == 2, by_phase, 0.0), 1) * (shape.bins * tl.load(at + 2).to(tl.float32))
+    return x, y, z

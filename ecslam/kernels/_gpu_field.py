@@ -32,8 +32,8 @@ class Field(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Sizes known when a kernel is compiled. width, blobs: levels and bins padded to a power of two of at least 16,
-    the least that a matrix product takes."""
+    """Sizes known when a kernel is compiled. width, blobs: levels and the bins of all three axes, padded to a power of
+    two; 2 width and blobs are at least 16, the least that a matrix product takes."""
 
     levels: int
     width: int
@@ -43,8 +43,8 @@ class Shape(NamedTuple):
 
 @triton.jit
 def on_box(field, world, axis: tl.constexpr, shape: tl.constexpr):
-    """One coordinate, float64 [P]: its distance from the anchor as float32 and what rounding lost, whether it was
-    inside the box, and its one-blob phase in bins."""
+    """One coordinate, float64 [P]: its distance from the anchor as float32 and what rounding lost, its one-blob phase
+    in bins, and 1 if it was inside the box, else 0."""
     at = field.geometry + axis
     low, high = tl.load(at + 9), tl.load(at + 12)
     x = tl.minimum(tl.maximum(world, low), high)
@@ -53,7 +53,7 @@ def on_box(field, world, axis: tl.constexpr, shape: tl.constexpr):
     rounded = near.to(tl.float32)
     lost = (near - rounded.to(tl.float64)).to(tl.float32)
     phase = ((period - tl.floor(period)) * shape.bins).to(tl.float32)
-    return rounded, lost, (x == world).to(tl.float32), phase
+    return rounded, lost, phase, (x == world).to(tl.float32)
 
 
 @triton.jit
@@ -166,26 +166,29 @@ def quartic(t):
 
 
 @triton.jit
-def one_blob(phase, shape: tl.constexpr):
-    """One axis' one-blob values [P, blobs] and their derivatives by the phase; four bins or more, so that the kernel
-    meets each bin once."""
-    bins = tl.arange(0, shape.blobs)
-    t = bins[None, :] + 0.5 - phase[:, None]
-    t = tl.where(t > shape.bins / 2, t - shape.bins, t)
-    t = tl.where(t < -shape.bins / 2, t + shape.bins, t)
-    there = (bins < shape.bins)[None, :]
-    value = tl.where(there, rise(t + 0.5) - rise(t - 0.5), 0.0)
-    return value, tl.where(there, quartic(t - 0.5) - quartic(t + 0.5), 0.0)
+def axis_of(shape: tl.constexpr):
+    """Which axis each column of a one-blob tile belongs to [blobs]; 3 or more: none."""
+    return tl.arange(0, shape.blobs) // shape.bins
 
 
 @triton.jit
-def place(field, world, shape: tl.constexpr):
-    """Points at world positions (x, y, z: float64 [P] each): what their corners add to row numbers, fractions within
-    the cells, one-blob phases, and which coordinates were inside the box."""
-    x, x_rest, in_x, phase_x = on_box(field, world[0], 0, shape)
-    y, y_rest, in_y, phase_y = on_box(field, world[1], 1, shape)
-    z, z_rest, in_z, phase_z = on_box(field, world[2], 2, shape)
-    fx, at_x = locate(field, x, x_rest, 0, 1, shape)
-    fy, at_y = locate(field, y, y_rest, 1, PRIME_Y, shape)
-    fz, at_z = locate(field, z, z_rest, 2, PRIME_Z, shape)
-    return (at_x, at_y, at_z), (fx, fy, fz), (phase_x, phase_y, phase_z), (in_x, in_y, in_z)
+def one_blob(phase, shape: tl.constexpr):
+    """One-blob values [P, blobs], axis after axis, and their derivatives by the phases; four bins or more, so that the
+    kernel meets each bin once."""
+    axis = axis_of(shape)[None, :]
+    middle = (tl.arange(0, shape.blobs) % shape.bins)[None, :] + 0.5
+    t = middle - tl.where(axis == 0, phase[0][:, None], tl.where(axis == 1, phase[1][:, None], phase[2][:, None]))
+    t = tl.where(t > shape.bins / 2, t - shape.bins, t)
+    t = tl.where(t < -shape.bins / 2, t + shape.bins, t)
+    value = tl.where(axis < 3, rise(t + 0.5) - rise(t - 0.5), 0.0)
+    return value, tl.where(axis < 3, quartic(t - 0.5) - quartic(t + 0.5), 0.0)
+
+
+@triton.jit
+def place(field, x, rest, shape: tl.constexpr):
+    """Points at distances from the anchor and what rounding lost (x, y, z: [P] each): what their corners add to row
+    numbers, and fractions within the cells."""
+    fx, at_x = locate(field, x[0], rest[0], 0, 1, shape)
+    fy, at_y = locate(field, x[1], rest[1], 1, PRIME_Y, shape)
+    fz, at_z = locate(field, x[2], rest[2], 2, PRIME_Z, shape)
+    return (at_x, at_y, at_z), (fx, fy, fz)

@@ -1,6 +1,7 @@
 """Triton kernels over blocks of points: values, and everything that flows back from them to map, points and poses.
 
-The way back is two kernels, decoders and grid: one kernel for both would need more registers than there are.
+Points are placed once, in float64; what is left to the other kernels is float32. The way back is three kernels,
+weights, decoders and grid: one kernel for all would need more registers than there are.
 """
 
 from __future__ import annotations
@@ -12,16 +13,14 @@ import triton.language as tl
 from torch import Tensor
 
 from ._gpu_decoders import (
-    OUTPUTS,
     WIDE,
-    add_readers,
+    add_reader,
     add_rows,
     blob_rows,
     decode,
     feature_rows,
     into_features,
     into_hidden,
-    is_colour,
     layer_one,
     product,
     through_blob,
@@ -102,83 +101,121 @@ def world_of(points, i, live, from_rays: tl.constexpr):
 
 
 @triton.jit
-def feature_places(i, live, shape: tl.constexpr):
-    """Where the features of points i lie in the buffer [N, 2 L]: [P, width, 2], and which exist."""
-    column = 2 * tl.arange(0, shape.width)[:, None] + tl.arange(0, 2)[None, :]
-    there = live[:, None, None] & (column < 2 * shape.levels)[None, :, :]
-    return 2 * shape.levels * i[:, None, None] + column[None, :, :], there
-
-
-@triton.jit
-def values_kernel(
-    field, points, sdf, rgb, features_at, from_rays: tl.constexpr, keep: tl.constexpr, shape: tl.constexpr,
-    block: tl.constexpr,
-):  # fmt: skip
-    """TSDF [N] and colour [N, 3] of points; with ``keep`` their grid features [N, 2 L] as well."""
+def place_kernel(field, points, placed, from_rays: tl.constexpr, shape: tl.constexpr, block: tl.constexpr):
+    """Place points: ``placed`` [12, N] takes their distances from the anchor (x, y, z), what rounding lost, their
+    one-blob phases, and 1 for coordinates inside the box, else 0."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < points.total
-    at, fraction, phase, _ = place(field, world_of(points, i, live, from_rays), shape)
-    features = gather(field, at, fraction, live, shape)
-    if keep:
-        where, there = feature_places(i, live, shape)
-        tl.store(features_at + where, tl.join(features[0], features[1]), there)
-    out = decode(field, layer_one(field, features, phase, shape))
-    output = tl.arange(0, OUTPUTS)[None, :]
-    tl.store(sdf + i[:, None] + 0 * output, out, live[:, None] & (output == 0))
-    tl.store(rgb + 3 * i[:, None] + output - 1, out, live[:, None] & is_colour(output))
+    world = world_of(points, i, live, from_rays)
+    for axis in tl.static_range(3):
+        found = on_box(field, world[axis], axis, shape)
+        for kind in tl.static_range(4):
+            tl.store(placed + (3 * kind + axis) * points.total + i, found[kind], live)
 
 
 @triton.jit
+def load_placed(placed, kind: tl.constexpr, i, live, total):
+    """One kind of what ``place_kernel`` found (x, y, z: [P] each)."""
+    at = placed + 3 * kind * total + i
+    return tl.load(at, live, 0.0), tl.load(at + total, live, 0.0), tl.load(at + 2 * total, live, 0.0)
+
+
+@triton.jit
+def level_places(i, live, total, shape: tl.constexpr):
+    """Where the even features of points i lie in the buffer [2 L, N]: [P, width], and which exist; the odd ones lie
+    ``total`` further on."""
+    level = tl.arange(0, shape.width)[None, :]
+    return 2 * level * total + i[:, None], live[:, None] & (level < shape.levels)
+
+
+@triton.jit
+def feature_places(i, live, total, shape: tl.constexpr):
+    """Where all features of points i lie in the buffer [2 L, N]: [2 width, P], and which exist."""
+    row, known = feature_rows(shape)
+    return row[:, None] * total + i[None, :], known[:, None] & live[None, :]
+
+
+@triton.jit
+def hidden_places(i, live):
+    """Where the hidden units of points i lie in the buffer [N, 64]: [P, 64], and which exist."""
+    unit = tl.arange(0, WIDE)[None, :]
+    return WIDE * i[:, None] + unit, live[:, None] & (unit >= 0)
+
+
+@triton.jit(do_not_specialize=["total"])
+def values_kernel(
+    field, placed, total, sdf, rgb, features_at, hidden_at, keep: tl.constexpr, shape: tl.constexpr,
+    block: tl.constexpr,
+):  # fmt: skip
+    """TSDF [N] and colour [N, 3] of points; with ``keep`` their grid features [2 L, N] and the hidden units before the
+    ReLU [N, 64] as well."""
+    i = tl.program_id(0) * block + tl.arange(0, block)
+    live = i < total
+    x, rest = load_placed(placed, 0, i, live, total), load_placed(placed, 1, i, live, total)
+    at, fraction = place(field, x, rest, shape)
+    even, odd = gather(field, at, fraction, live, shape)
+    blob, _ = one_blob(load_placed(placed, 2, i, live, total), shape)
+    hidden = layer_one(field, tl.interleave(even, odd), blob, shape)
+    if keep:
+        where, there = level_places(i, live, total, shape)
+        tl.store(features_at + where, even, there)
+        tl.store(features_at + total + where, odd, there)
+        where, there = hidden_places(i, live)
+        tl.store(hidden_at + where, hidden, there)
+    out = decode(field, hidden)
+    tl.store(sdf + i, out[0], live)
+    for k in tl.static_range(3):
+        tl.store(rgb + 3 * i + k, out[1 + k], live)
+
+
+@triton.jit(do_not_specialize=["total"])
 def decoders_kernel(
-    field, points, d_sdf, d_rgb, features_at, d_world, into, blocks, want_params: tl.constexpr,
+    field, placed, total, d_sdf, d_rgb, hidden_at, d_features_at, d_world, into, want_params: tl.constexpr,
     want_poses: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
-    """From the gradients of TSDF [N] and of colour before its sigmoid [N, 3] to the decoders and the grid features,
-    which are overwritten by their gradients, and to the position through the one-blob part, d_world [N, 3].
-
-    A program takes every n-th block and keeps its share of the decoders' gradient in registers until the end.
-    """
-    d_even_rows = tl.full([shape.width, WIDE], 0, tl.float32)
-    d_odd_rows = tl.full([shape.width, WIDE], 0, tl.float32)
-    d_x_rows = tl.full([shape.blobs, WIDE], 0, tl.float32)
-    d_y_rows = tl.full([shape.blobs, WIDE], 0, tl.float32)
-    d_z_rows = tl.full([shape.blobs, WIDE], 0, tl.float32)
-    d_readers = tl.full([OUTPUTS, WIDE], 0, tl.float32)
-    output = tl.arange(0, OUTPUTS)[None, :]
-    for number in range(tl.program_id(0), blocks, tl.num_programs(0)):
-        i = number * block + tl.arange(0, block)
-        live = i < points.total
-        world = world_of(points, i, live, True)
-        phase = (
-            on_box(field, world[0], 0, shape)[3],
-            on_box(field, world[1], 1, shape)[3],
-            on_box(field, world[2], 2, shape)[3],
-        )
-        where, there = feature_places(i, live, shape)
-        features = tl.split(tl.load(features_at + where, there, 0.0))
-        hidden = layer_one(field, features, phase, shape)
-        d_out = tl.load(d_sdf + i[:, None] + 0 * output, live[:, None] & (output == 0), 0.0)
-        d_out += tl.load(d_rgb + 3 * i[:, None] + output - 1, live[:, None] & is_colour(output), 0.0)
-        d_hidden = into_hidden(field, hidden, d_out)
-        d_features = into_features(field, d_hidden, shape)
-        tl.store(features_at + where, tl.join(d_features[0], d_features[1]), there)
-        if want_poses:
-            for axis in tl.static_range(3):
-                tl.store(d_world + 3 * i + axis, through_blob(field, d_hidden, phase, axis, shape), live)
-        if want_params:
-            d_readers += product(tl.trans(d_out), tl.maximum(hidden, 0.0))
-            d_even_rows += product(tl.trans(features[0]), d_hidden)
-            d_odd_rows += product(tl.trans(features[1]), d_hidden)
-            d_x_rows += product(tl.trans(one_blob(phase[0], shape)[0]), d_hidden)
-            d_y_rows += product(tl.trans(one_blob(phase[1], shape)[0]), d_hidden)
-            d_z_rows += product(tl.trans(one_blob(phase[2], shape)[0]), d_hidden)
+    """From the gradients of TSDF [N] and of colour before its sigmoid [N, 3] to the decoders' last layer, to the hidden
+    units, which are overwritten by their gradients (both with ``want_params``), to the grid features [2 L, N] and, with
+    ``want_poses``, to the position through the one-blob part, d_world [N, 3]."""
+    i = tl.program_id(0) * block + tl.arange(0, block)
+    live = i < total
+    where, there = hidden_places(i, live)
+    hidden = tl.load(hidden_at + where, there, 0.0)
+    to_sdf, to_red = tl.load(d_sdf + i, live, 0.0), tl.load(d_rgb + 3 * i, live, 0.0)
+    to_green, to_blue = tl.load(d_rgb + 3 * i + 1, live, 0.0), tl.load(d_rgb + 3 * i + 2, live, 0.0)
+    d_out = to_sdf, to_red, to_green, to_blue
+    d_hidden = into_hidden(field, hidden, d_out)
     if want_params:
-        add_rows(into.w_in, feature_rows(0, shape), d_even_rows)
-        add_rows(into.w_in, feature_rows(1, shape), d_odd_rows)
-        add_rows(into.w_in, blob_rows(0, shape), d_x_rows)
-        add_rows(into.w_in, blob_rows(1, shape), d_y_rows)
-        add_rows(into.w_in, blob_rows(2, shape), d_z_rows)
-        add_readers(into, d_readers)
+        tl.store(hidden_at + where, d_hidden, there)
+        for output in tl.static_range(4):
+            add_reader(into, output, tl.sum(tl.maximum(hidden, 0.0) * d_out[output][:, None], 0))
+    where, there = feature_places(i, live, total, shape)
+    tl.store(d_features_at + where, tl.trans(into_features(field, d_hidden, shape)), there)
+    if want_poses:
+        _, slope = one_blob(load_placed(placed, 2, i, live, total), shape)
+        gradient = through_blob(field, d_hidden, slope, shape)
+        for axis in tl.static_range(3):
+            tl.store(d_world + 3 * i + axis, gradient[axis], live)
+
+
+@triton.jit(do_not_specialize=["total"])
+def weights_kernel(placed, total, features_at, d_hidden_at, into, blocks, shape: tl.constexpr, block: tl.constexpr):
+    """From the gradients of the hidden units [N, 64] to the decoders' first layer.
+
+    A program takes every n-th block and keeps its share of the gradient in registers until the end.
+    """
+    by_feature = tl.full([2 * shape.width, WIDE], 0, tl.float32)
+    by_blob = tl.full([shape.blobs, WIDE], 0, tl.float32)
+    for number in tl.range(tl.program_id(0), blocks, tl.num_programs(0), num_stages=1):
+        i = number * block + tl.arange(0, block)
+        live = i < total
+        where, there = hidden_places(i, live)
+        d_hidden = tl.load(d_hidden_at + where, there, 0.0)
+        where, there = feature_places(i, live, total, shape)
+        by_feature += product(tl.load(features_at + where, there, 0.0), d_hidden)
+        blob, _ = one_blob(load_placed(placed, 2, i, live, total), shape)
+        by_blob += product(tl.trans(blob), d_hidden)
+    add_rows(into.w_in, feature_rows(shape), by_feature)
+    add_rows(into.w_in, blob_rows(shape), by_blob)
 
 
 @triton.jit
@@ -198,21 +235,24 @@ def add_poses(d_c2w, live, local, pose, gradient):
         tl.atomic_add(d_c2w + 12 * p + 4 * row + column, total, (row < 3) & (column >= 0), sem="relaxed")
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["total"])
 def grid_kernel(
-    field, points, d_features_at, d_world, into, d_c2w, want_params: tl.constexpr, want_poses: tl.constexpr,
-    shape: tl.constexpr, block: tl.constexpr,
+    field, points, placed, total, d_features_at, d_world, into, d_c2w, want_params: tl.constexpr,
+    want_poses: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
-    """From the gradients of the grid features [N, 2 L] to the table and, with the one-blob part of the position's
+    """From the gradients of the grid features [2 L, N] to the table and, with the one-blob part of the position's
     gradient d_world [N, 3], to the poses."""
     i = tl.program_id(0) * block + tl.arange(0, block)
-    live = i < points.total
-    at, fraction, _, inside = place(field, world_of(points, i, live, True), shape)
-    where, there = feature_places(i, live, shape)
-    d_even, d_odd = tl.split(tl.load(d_features_at + where, there, 0.0))
+    live = i < total
+    x, rest = load_placed(placed, 0, i, live, total), load_placed(placed, 1, i, live, total)
+    at, fraction = place(field, x, rest, shape)
+    where, there = level_places(i, live, total, shape)
+    d_even = tl.load(d_features_at + where, there, 0.0)
+    d_odd = tl.load(d_features_at + total + where, there, 0.0)
     if want_params:
         scatter(field, into.table, at, fraction, d_even, d_odd, live, shape)
     if want_poses:
+        inside = load_placed(placed, 3, i, live, total)
         gx, gy, gz = pull(field, at, fraction, d_even, d_odd, live, shape)
         gradient = (
             (gx + tl.load(d_world + 3 * i, live, 0.0)) * inside[0],

@@ -1,9 +1,10 @@
 """The fused GPU back end (Triton): kernels over blocks of points and of rays.
 
-A step is five launches: clear; encode and decode; render, compare and differentiate; decoders back; grid back. In
-between lie TSDF, colour and the grid's features, later their gradients, which a GPU's cache holds. No launch waits for
-the host, sizes depend on shapes alone and memory comes from torch, so a CUDA graph can record whole loops
-(``graphs``). Sums are taken by atomics in varying order: results vary in their last digits.
+A step is six launches, seven if the map learns: clear; place; encode and decode; render, compare and differentiate;
+decoders back; weights back; grid back. In between lie places, TSDF, colour, hidden units and the grid's features, and
+their gradients, which a GPU's cache holds. No launch waits for the host, sizes depend on shapes alone and memory comes
+from torch, so a CUDA graph can record whole loops (``graphs``). Sums are taken by atomics in varying order: results
+vary in their last digits.
 
 With TRITON_INTERPRET=1 the same code runs in Triton's interpreter on the CPU, for the tests.
 """
@@ -24,11 +25,17 @@ if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
 from ._gpu_align import SUMS, align_kernel, gradients_kernel
 from ._gpu_device import beside, processors
 from ._gpu_field import Field, Shape
-from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, values_kernel
+from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, place_kernel, values_kernel, weights_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
 from .poses_gpu import pose_step as pose_step
 
-BLOCK = 32  # points; the way back already spills registers, and with 64 far more (ptxas, compute capability 9.0)
+VALUES_BLOCK, VALUES_WARPS = 64, 4  # sixteen points a warp, which one instruction of a tensor core takes
+DECODERS_BLOCK, DECODERS_WARPS = 64, 4  # likewise
+WEIGHTS_BLOCK, WEIGHTS_WARPS = 64, 4  # likewise
+GRID_BLOCK, GRID_WARPS = 32, 4  # no products: few registers a thread let more programs share a processor
+ALIGN_BLOCK, ALIGN_WARPS = 64, 4  # points and warps of the gradients in space
+PLACE_BLOCK = 128  # one point a thread
+HIDDEN = 64  # units of both decoders
 RAY_ELEMENTS = 512  # padded samples that one program renders
 PROGRAMS_A_PROCESSOR = 2
 
@@ -66,7 +73,7 @@ def _padded(count: int, least: int) -> int:
 
 
 def _shape(layout: GridLayout) -> Shape:
-    return Shape(layout.levels, _padded(layout.levels, 16), layout.bins, _padded(layout.bins, 16))
+    return Shape(layout.levels, _padded(layout.levels, 8), layout.bins, _padded(3 * layout.bins, 16))
 
 
 def _places(points: Tensor, c2w: Tensor | None = None) -> Points:
@@ -85,8 +92,8 @@ def _targets(rays: RayBatch) -> Targets:
     return Targets(_flat(rays.z), _flat(rays.depth), _flat(rays.color), feature, *rays.z.shape)
 
 
-def _blocks(count: int) -> int:
-    return -(-count // BLOCK)
+def _blocks(count: int, block: int) -> int:
+    return -(-count // block)
 
 
 def _ray_grid(rays: int, samples: int) -> tuple[tuple[int], dict[str, int]]:
@@ -96,15 +103,26 @@ def _ray_grid(rays: int, samples: int) -> tuple[tuple[int], dict[str, int]]:
     return (-(-rays // block),), {"block": block, "padded": padded}
 
 
-def _evaluate(
-    layout: GridLayout, field: Field, points: Points, from_rays: bool, features: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """TSDF [N] and colour [N, 3]; the grid features go into ``features`` [N, 2 L], if given."""
-    sdf, rgb = points.position.new_empty(points.total), points.position.new_empty(points.total, 3)
+def _place(layout: GridLayout, field: Field, points: Points, from_rays: bool) -> Tensor:
+    """Where points lie, as ``place_kernel`` has it [12, N]."""
+    placed = points.position.new_empty(12, points.total)
     if points.total:
-        values_kernel[(_blocks(points.total),)](
-            field, points, sdf, rgb, sdf if features is None else features,
-            from_rays=from_rays, keep=features is not None, shape=_shape(layout), block=BLOCK,
+        place_kernel[(_blocks(points.total, PLACE_BLOCK),)](
+            field, points, placed, from_rays=from_rays, shape=_shape(layout), block=PLACE_BLOCK
+        )
+    return placed
+
+
+def _evaluate(
+    layout: GridLayout, field: Field, placed: Tensor, kept: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    """TSDF [N] and colour [N, 3]; grid features and hidden units go into ``kept`` ([2 L, N], [N, 64]), if given."""
+    total = placed.shape[1]
+    sdf, rgb = placed.new_empty(total), placed.new_empty(total, 3)
+    if total:
+        values_kernel[(_blocks(total, VALUES_BLOCK),)](
+            field, placed, total, sdf, rgb, *(kept or (sdf, sdf)),
+            keep=kept is not None, shape=_shape(layout), block=VALUES_BLOCK, num_warps=VALUES_WARPS,
         )  # fmt: skip
     return sdf, rgb
 
@@ -112,7 +130,8 @@ def _evaluate(
 def values(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor]:
     """See ``reference.values``."""
     with beside(points):
-        return _evaluate(layout, _field(layout, params), _places(points), False)
+        field = _field(layout, params)
+        return _evaluate(layout, field, _place(layout, field, _places(points), False))
 
 
 def gradients(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -122,7 +141,9 @@ def gradients(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[
     found = new(n), new(n, 3), new(n), new(n, 3)
     if n:
         with beside(points):
-            gradients_kernel[(_blocks(n),)](_field(layout, params), given, *found, shape=_shape(layout), block=BLOCK)
+            gradients_kernel[(_blocks(n, ALIGN_BLOCK),)](
+                _field(layout, params), given, *found, shape=_shape(layout), block=ALIGN_BLOCK, num_warps=ALIGN_WARPS
+            )
     return found
 
 
@@ -134,7 +155,8 @@ def render(layout: GridLayout, params: FieldParams, c2w: Tensor, rays: RayBatch)
     if z.numel():
         grid, sizes = _ray_grid(targets.rays, targets.samples)
         with beside(z):
-            sdf, rgb = _evaluate(layout, _field(layout, params), _samples(c2w, rays), True)
+            field = _field(layout, params)
+            sdf, rgb = _evaluate(layout, field, _place(layout, field, _samples(c2w, rays), True))
             render_kernel[grid](targets, sdf, rgb, _flat(params.beta), color, depth, weights, **sizes)
     return color, depth, weights
 
@@ -172,25 +194,32 @@ def _step(
 ) -> None:
     """Add to ``losses``, to ``into`` and to ``d_c2w``, where they are wanted."""
     field, beta, shape = _field(layout, params), _flat(params.beta), _shape(layout)
-    features = beta.new_empty(points.total, 2 * layout.levels)
-    sdf, rgb = _evaluate(layout, field, points, True, features)
+    total, placed = points.total, _place(layout, field, points, True)
+    features, hidden = beta.new_empty(2 * layout.levels, total), beta.new_empty(total, HIDDEN)
+    sdf, rgb = _evaluate(layout, field, placed, (features, hidden))
     grid, sizes = _ray_grid(targets.rays, targets.samples)
     numbers = tuple(float(getattr(weights, name)) for name in Weights.__dataclass_fields__)
     d_beta = beta if into is None else into.beta
     losses_kernel[grid](targets, sdf, rgb, beta, numbers, losses, d_beta, want_beta=into is not None, **sizes)
     if into is None and d_c2w is None:
         return
-    wanted = {"want_params": into is not None, "want_poses": d_c2w is not None}
     sink = Into(*(getattr(into or params, name) for name in Into._fields))
-    blocks, d_world = _blocks(points.total), beta.new_empty(points.total, 3)
-    programs = blocks if into is None else min(blocks, PROGRAMS_A_PROCESSOR * processors(losses.device))
-    decoders_kernel[(programs,)](
-        field, points, sdf, rgb, features, d_world, sink, blocks, **wanted, shape=shape, block=BLOCK
-    )
+    wanted = {"want_params": into is not None, "want_poses": d_c2w is not None}
+    d_features, d_world = torch.empty_like(features), beta.new_empty(total, 3)
+    decoders_kernel[(_blocks(total, DECODERS_BLOCK),)](
+        field, placed, total, sdf, rgb, hidden, d_features, d_world, sink,
+        **wanted, shape=shape, block=DECODERS_BLOCK, num_warps=DECODERS_WARPS,
+    )  # fmt: skip
+    if into is not None:
+        blocks = _blocks(total, WEIGHTS_BLOCK)
+        weights_kernel[(min(blocks, PROGRAMS_A_PROCESSOR * processors(losses.device)),)](
+            placed, total, features, hidden, sink, blocks, shape=shape, block=WEIGHTS_BLOCK, num_warps=WEIGHTS_WARPS
+        )
     unused = losses
-    grid_kernel[(blocks,)](
-        field, points, features, d_world, sink, unused if d_c2w is None else d_c2w, **wanted, shape=shape, block=BLOCK
-    )
+    grid_kernel[(_blocks(total, GRID_BLOCK),)](
+        field, points, placed, total, d_features, d_world, sink, unused if d_c2w is None else d_c2w,
+        **wanted, shape=shape, block=GRID_BLOCK, num_warps=GRID_WARPS,
+    )  # fmt: skip
 
 
 def normal_equations(
@@ -202,9 +231,9 @@ def normal_equations(
     if n:
         numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
         with beside(points):
-            align_kernel[(_blocks(n),)](
+            align_kernel[(_blocks(n, ALIGN_BLOCK),)](
                 _field(layout, params), _places(points, c2w), _flat(luminance), numbers, sums,
-                colour=settings.colour_weight > 0, shape=_shape(layout), block=BLOCK,
+                colour=settings.colour_weight > 0, shape=_shape(layout), block=ALIGN_BLOCK, num_warps=ALIGN_WARPS,
             )  # fmt: skip
     total = sums.cpu()
     products, (cost, used, inliers) = total[:64].view(8, 8), total[64:].tolist()
