@@ -144,11 +144,12 @@ def pull(field, at, fraction, d_even, d_odd, live, shape: tl.constexpr):
 def scatter(field, into, at, fraction, d_even, d_odd, live, shape: tl.constexpr):
     """Add the gradients of both features to the eight corners of the table's gradient ``into``."""
     fx, fy, fz = fraction
+    both = tl.join(d_even, d_odd)
     for c in tl.static_range(8):
         share = (fx if c % 2 else 1 - fx) * (fy if c // 2 % 2 else 1 - fy) * (fz if c // 4 else 1 - fz)
         place, there = entry(field, at[0][c % 2], at[1][c // 2 % 2], at[2][c // 4], live, shape)
         there = there & (tl.arange(0, 2) >= 0)[None, None, :]
-        tl.atomic_add(into + place, tl.join(share * d_even, share * d_odd), there, sem="relaxed")
+        tl.atomic_add(into + place, share[:, :, None] * both, there, sem="relaxed")
 
 
 @triton.jit

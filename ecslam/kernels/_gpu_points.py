@@ -122,17 +122,19 @@ def load_placed(placed, kind: tl.constexpr, i, live, total):
 
 @triton.jit
 def level_places(i, live, total, shape: tl.constexpr):
-    """Where the even features of points i lie in the buffer [2 L, N]: [P, width], and which exist; the odd ones lie
-    ``total`` further on."""
+    """Where the even features of points i lie in the buffer [2, L, N]: [P, width], and which exist; the odd ones lie
+    ``levels * total`` further on."""
     level = tl.arange(0, shape.width)[None, :]
-    return 2 * level * total + i[:, None], live[:, None] & (level < shape.levels)
+    return level * total + i[:, None], live[:, None] & (level < shape.levels)
 
 
 @triton.jit
 def feature_places(i, live, total, shape: tl.constexpr):
-    """Where all features of points i lie in the buffer [2 L, N]: [2 width, P], and which exist."""
+    """Where all features of points i lie in the buffer [2, L, N], in the order of w_in: [2 width, P], and which
+    exist."""
     row, known = feature_rows(shape)
-    return row[:, None] * total + i[None, :], known[:, None] & live[None, :]
+    at = (row % 2) * shape.levels + row // 2
+    return at[:, None] * total + i[None, :], known[:, None] & live[None, :]
 
 
 @triton.jit
@@ -147,7 +149,7 @@ def values_kernel(
     field, placed, total, sdf, rgb, features_at, hidden_at, keep: tl.constexpr, shape: tl.constexpr,
     block: tl.constexpr,
 ):  # fmt: skip
-    """TSDF [N] and colour [N, 3] of points; with ``keep`` their grid features [2 L, N] and the hidden units before the
+    """TSDF [N] and colour [N, 3] of points; with ``keep`` their grid features [2, L, N] and the hidden units before the
     ReLU [N, 64] as well."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
@@ -159,7 +161,7 @@ def values_kernel(
     if keep:
         where, there = level_places(i, live, total, shape)
         tl.store(features_at + where, even, there)
-        tl.store(features_at + total + where, odd, there)
+        tl.store(features_at + shape.levels * total + where, odd, there)
         where, there = hidden_places(i, live)
         tl.store(hidden_at + where, hidden, there)
     out = decode(field, hidden)
@@ -174,7 +176,7 @@ def decoders_kernel(
     want_poses: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     """From the gradients of TSDF [N] and of colour before its sigmoid [N, 3] to the decoders' last layer, to the hidden
-    units, which are overwritten by their gradients (both with ``want_params``), to the grid features [2 L, N] and, with
+    units, which are overwritten by their gradients (both with ``want_params``), to the grid features [2, L, N] and, with
     ``want_poses``, to the position through the one-blob part, d_world [N, 3]."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
@@ -240,7 +242,7 @@ def grid_kernel(
     field, points, placed, total, d_features_at, d_world, into, d_c2w, want_params: tl.constexpr,
     want_poses: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
-    """From the gradients of the grid features [2 L, N] to the table and, with the one-blob part of the position's
+    """From the gradients of the grid features [2, L, N] to the table and, with the one-blob part of the position's
     gradient d_world [N, 3], to the poses."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
@@ -248,7 +250,7 @@ def grid_kernel(
     at, fraction = place(field, x, rest, shape)
     where, there = level_places(i, live, total, shape)
     d_even = tl.load(d_features_at + where, there, 0.0)
-    d_odd = tl.load(d_features_at + total + where, there, 0.0)
+    d_odd = tl.load(d_features_at + shape.levels * total + where, there, 0.0)
     if want_params:
         scatter(field, into.table, at, fraction, d_even, d_odd, live, shape)
     if want_poses:

@@ -32,7 +32,7 @@ from .poses_gpu import pose_step as pose_step
 VALUES_BLOCK, VALUES_WARPS = 64, 4  # sixteen points a warp, which one instruction of a tensor core takes
 DECODERS_BLOCK, DECODERS_WARPS = 64, 4  # likewise
 WEIGHTS_BLOCK, WEIGHTS_WARPS = 64, 4  # likewise
-GRID_BLOCK, GRID_WARPS = 32, 4  # no products: few registers a thread let more programs share a processor
+GRID_BLOCK, GRID_WARPS = 32, 8  # no products: two levels a thread, so that many threads share a processor
 ALIGN_BLOCK, ALIGN_WARPS = 64, 4  # points and warps of the gradients in space
 PLACE_BLOCK = 128  # one point a thread
 HIDDEN = 64  # units of both decoders
@@ -116,7 +116,7 @@ def _place(layout: GridLayout, field: Field, points: Points, from_rays: bool) ->
 def _evaluate(
     layout: GridLayout, field: Field, placed: Tensor, kept: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    """TSDF [N] and colour [N, 3]; grid features and hidden units go into ``kept`` ([2 L, N], [N, 64]), if given."""
+    """TSDF [N] and colour [N, 3]; grid features and hidden units go into ``kept`` ([2, L, N], [N, 64]), if given."""
     total = placed.shape[1]
     sdf, rgb = placed.new_empty(total), placed.new_empty(total, 3)
     if total:
@@ -195,7 +195,7 @@ def _step(
     """Add to ``losses``, to ``into`` and to ``d_c2w``, where they are wanted."""
     field, beta, shape = _field(layout, params), _flat(params.beta), _shape(layout)
     total, placed = points.total, _place(layout, field, points, True)
-    features, hidden = beta.new_empty(2 * layout.levels, total), beta.new_empty(total, HIDDEN)
+    features, hidden = beta.new_empty(2, layout.levels, total), beta.new_empty(total, HIDDEN)
     sdf, rgb = _evaluate(layout, field, placed, (features, hidden))
     grid, sizes = _ray_grid(targets.rays, targets.samples)
     numbers = tuple(float(getattr(weights, name)) for name in Weights.__dataclass_fields__)
