@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .pixels import Pixels
 from .rays import DevicePixels, upload
 
-LEAST_ROOM = 1 << 20
+LEAST_ROOM = 1 << 22  # more room is another place, over which loops are recorded anew
 
 
 class PixelBank:

@@ -37,10 +37,10 @@ class PoseAdam:
         self._mean, self._square = torch.zeros_like(rates), torch.zeros_like(rates)
         self._count, self._kernels = 0, kernels
 
-    def step(self, d_c2w: Tensor, share: float | Tensor = 1.0) -> None:
-        """One update from gradients [P, 3, 4] at ``share`` of the learning rates."""
+    def step(self, d_c2w: Tensor, share: float | Tensor | None = None) -> None:
+        """One update from gradients [P, 3, 4] at ``share`` of the learning rates; None: at all of them."""
         self._count += 1
-        moments, rates = (self._mean, self._square), share * self._rates
+        moments, rates = (self._mean, self._square), self._rates if share is None else share * self._rates
         self.c2w = self._kernels.pose_step(
             self.c2w, d_c2w, *moments, rates, self._about, self._decays, EPSILON, self._count
         )

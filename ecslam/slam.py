@@ -29,6 +29,7 @@ from .observed import ObservedVoxels
 from .observed_gpu import ObservedTable
 from .pixels import Pixels, spread_pixels
 from .recovery import Recovery, around, best_start, search
+from .samples import seeded
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .tracker import LEAST_POINTS, HostTracker, Tracker, TrackResult, track_direct
 from .trajectory import Trajectory
@@ -95,7 +96,9 @@ class Slam:
 
         assert not isinstance(self._volume, FusedVolume | None)
         observed = ObservedTable(self.device)
-        return observed, GpuTracker(self.intrinsics, self._volume, observed, self._kernels, self._recorder)
+        generator = seeded(self._rng, self.device)
+        follow = GpuTracker(self.intrinsics, self._volume, observed, self._kernels, generator, self._recorder)
+        return observed, follow
 
     # ---- one frame --------------------------------------------------------------------------------------------------
 
@@ -197,9 +200,7 @@ class Slam:
         gap = frame.timestamp - self.trajectory.timestamps[-1] > GAP_S
         guess = self.trajectory[-1] if self._recovery.lost or gap else self.trajectory.predict()
         field, config, tracker = self._require_field(), self.config, self._tracker()
-        track = best_start(
-            lambda start: tracker.track(frame, start, field, config, self._rng), around(guess) if gap else [guess]
-        )
+        track = best_start(lambda start: tracker.track(frame, start, field, config), around(guess) if gap else [guess])
         return self._recovery.judge(track, self.trajectory[-1], lambda: self._relocalise(frame))
 
     def _tracker(self) -> Tracker:
@@ -209,7 +210,9 @@ class Slam:
             return self._gpu_tracker
         assert isinstance(self._observed, ObservedVoxels)
         generator = self._generator if self._on_cpu else None
-        return HostTracker(self.intrinsics, self._surface(), self._observed, self._kernels, generator, self._recorder)
+        return HostTracker(
+            self.intrinsics, self._surface(), self._observed, self._kernels, self._rng, generator, self._recorder
+        )
 
     def _see(self) -> None:
         """Bring up to date where the map has been observed."""

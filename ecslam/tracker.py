@@ -41,9 +41,7 @@ class TrackResult:
 class Tracker(Protocol):
     """Follows the camera from frame to frame."""
 
-    def track(
-        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, rng: np.random.Generator
-    ) -> TrackResult:
+    def track(self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config) -> TrackResult:
         """The pose of a frame, sought from ``guess`` [4, 4]; ``guess`` itself with a fit of 0 where hardly anything is
         measured."""
         ...
@@ -52,21 +50,21 @@ class Tracker(Protocol):
 @dataclass(frozen=True)
 class HostTracker:
     """Tracking that the host goes through step by step. surface: what frames are aligned to. observed: where the map
-    may be trusted. generator: for the samples along rays; None: one from ``rng`` on the field's device."""
+    may be trusted. rng: for pixels. generator: for the samples along rays; None: one from ``rng`` on the field's
+    device."""
 
     camera: Intrinsics
     surface: Surface
     observed: ObservedVoxels
     kernels: Backend
+    rng: np.random.Generator
     generator: torch.Generator | None
     recorder: Recorder
 
-    def track(
-        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, rng: np.random.Generator
-    ) -> TrackResult:
+    def track(self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config) -> TrackResult:
         """See ``Tracker``. Direct alignment of points spread over the image, then the paper's rendered tracking; the
         preset may leave either out."""
-        surface, measured = self.surface, spread_pixels(frame, self.camera, config.align.points, config, rng)
+        surface, measured = self.surface, spread_pixels(frame, self.camera, config.align.points, config, self.rng)
         if len(measured.points()) < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
         c2w, losses = guess, {}
@@ -75,9 +73,9 @@ class HostTracker:
             found = align(surface, points, guess, config)
             c2w, losses = found.c2w, {"align_mm": 1e3 * found.cost**0.5}
         if config.tracking.iterations > 0:
-            pixels = choose_pixels(frame, self.camera, config.tracking.rays, config, rng)
+            pixels = choose_pixels(frame, self.camera, config.tracking.rays, config, self.rng)
             pixels = self.observed.known(pixels, c2w, same_count=field.device.type != "cpu")
-            generator = self.generator or seeded(rng, field.device)
+            generator = self.generator or seeded(self.rng, field.device)
             rendered, losses = track_adam(field, self.kernels, pixels, c2w, config, generator, self.recorder)
             agreed = WORSE * cost_at(surface, points, c2w, config)
             if config.align.to == "none" or cost_at(surface, points, rendered, config) <= agreed:
@@ -123,18 +121,17 @@ def descend_rendered(
     *rays: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The iterations, never waiting for the device: the best iterate [1, 4, 4] and the terms [5] there."""
-    batch = RayBatch(*rays)
-    optimiser, best = PoseAdam(c2w, rates, momentum, view_centre(batch)[None], kernels), c2w
-    best_terms = torch.full((len(LOSS_NAMES),), torch.inf, device=c2w.device)
+    batch, poses, terms = RayBatch(*rays), [], []
+    optimiser = PoseAdam(c2w, rates, momentum, view_centre(batch)[None], kernels)
     for _ in range(iterations):
-        pose = optimiser.c2w.float()
-        result = kernels.step(field.layout, field.params, pose, batch, weights, None, True)
-        better = result.losses.sum() < best_terms.sum()
-        best = torch.where(better, optimiser.c2w, best)
-        best_terms = torch.where(better, result.losses, best_terms)
+        result = kernels.step(field.layout, field.params, optimiser.c2w.float(), batch, weights, None, True)
+        poses.append(optimiser.c2w)
+        terms.append(result.losses)
         assert result.d_c2w is not None
         optimiser.step(result.d_c2w)
-    return best, best_terms
+    losses = torch.stack(terms)
+    best = losses.sum(1).nan_to_num(nan=torch.inf).argmin()[None]
+    return torch.cat(poses).index_select(0, best), losses.index_select(0, best)[0]
 
 
 def fit(surface: Surface, pixels: Pixels, c2w: NDArray[np.float64], truncation_m: float) -> float:

@@ -26,7 +26,7 @@ from .observed_gpu import ObservedTable
 from .pixels_gpu import DeviceFrame, choose, compacted, grid_cells, light_of, padded_corners, spread
 from .pose_adam import pose_rates
 from .rays import DevicePixels, kernel_weights, make_rays
-from .samples import seeded, uniform
+from .samples import uniform
 from .tracker import LEAST_POINTS, LEAST_SEEN, WORSE, TrackResult, descend_rendered
 from .types import Frame, Intrinsics
 from .volume_gpu import RULES, GpuVolume
@@ -36,31 +36,31 @@ HEADER = 15  # numbers of a result before the loss terms: pose [3, 4], cost, fit
 
 @dataclass(frozen=True)
 class GpuTracker:
-    """What tracking reads. volume: what frames are aligned to. observed: where the map may be trusted."""
+    """What tracking reads. volume: what frames are aligned to. observed: where the map may be trusted. generator: on
+    the device, for pixels and samples."""
 
     camera: Intrinsics
     volume: GpuVolume
     observed: ObservedTable
     kernels: Backend
+    generator: torch.Generator
     recorder: Recorder
 
-    def track(
-        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, rng: np.random.Generator
-    ) -> TrackResult:
+    def track(self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config) -> TrackResult:
         """The pose of a frame, sought from ``guess`` [4, 4]."""
         device, shown = field.device, self.volume.show(frame)
         a, t, s = config.align, config.tracking, config.sampling
         points, rays = grid_cells(shown, a.points, config), t.rays if t.iterations else 0
-        numbers = uniform(seeded(rng, device), device, 2 * points + rays * (3 + s.uniform + s.near_depth))
+        numbers = uniform(self.generator, device, 2 * points + rays * (3 + s.uniform + s.near_depth))
         corners = torch.from_numpy(padded_corners(frame, config, rays)).to(device, non_blocking=True)
         start = torch.from_numpy(guess).to(device, non_blocking=True)
         order = _shuffled(grid_cells(shown, rays, config) if rays else 0, device)
-        rates = pose_rates(torch.zeros(1, dtype=torch.bool), t.lr_rotation, t.lr_translation).to(device)
+        rates = _rates(t.lr_rotation, t.lr_translation, device)
         (found,) = self.recorder(
             partial(self._whole, field, self.volume.blocks, config),
             *(shown.color, shown.depth, corners, order, start, rates, numbers),
-            key=config,
-            over=(field, self.volume.blocks),
+            key=None,
+            over=(config, field, self.volume.blocks),
         )
         pose, (cost, fit, usable), terms = np.split(found.cpu().numpy(), [12, HEADER])
         if usable < LEAST_POINTS:
@@ -132,6 +132,11 @@ class GpuTracker:
         known = has & ~distance.isnan()
         share = (known & (distance.abs() < near_m)).sum() / known.sum().clamp_min(1).double()
         return torch.where(known.sum() < LEAST_SEEN * has.sum().clamp_min(1), 0.0, share), has.sum().double()
+
+
+@cache
+def _rates(lr_rotation: float, lr_translation: float, device: torch.device) -> Tensor:
+    return pose_rates(torch.zeros(1, dtype=torch.bool), lr_rotation, lr_translation).to(device)
 
 
 @cache

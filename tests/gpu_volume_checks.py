@@ -291,16 +291,18 @@ def trackers(pair):
     for seen in (observed, table):
         seen.add(spread_pixels(corners()[0], CAMERA, 1500, CONFIG, np.random.default_rng(0)).points(), POSES[0])
     field = create_field(TINY.field, np.array([[-2.0, -2, 0], [2, 2, 3]]), 0, torch.device("cpu"))
-    host = HostTracker(CAMERA, pair[0], observed, reference, torch.Generator(), Recorder(plain=True))
-    device = GpuTracker(CAMERA, pair[1], table, gpu, Recorder())
+    host = HostTracker(
+        CAMERA, pair[0], observed, reference, np.random.default_rng(0), torch.Generator(), Recorder(plain=True)
+    )
+    device = GpuTracker(CAMERA, pair[1], table, gpu, torch.Generator(DEVICE), Recorder())
     return (host, field), (device, TsdfField(field.layout, moved(field.params, DEVICE)))
 
 
 def test_a_frame_is_tracked_as_on_the_host(pair):
     seen = look(TRUE, corner(), CAMERA)
     for tracker, field in trackers(pair):
-        for repeat in range(2):  # the second one is recorded, where that can be
-            found = tracker.track(seen, GUESS, field, TINY, np.random.default_rng(repeat))
+        for _ in range(2):  # the second one is recorded, where that can be
+            found = tracker.track(seen, GUESS, field, TINY)
             np.testing.assert_allclose(found.c2w, TRUE, atol=4e-3)
             assert found.fit > 0.95
             assert 0 < found.losses["align_mm"] < 5
@@ -309,22 +311,20 @@ def test_a_frame_is_tracked_as_on_the_host(pair):
 def test_a_rendered_pose_is_taken_only_where_the_surface_agrees(pair):
     seen = look(TRUE, corner(), CAMERA)
     rendered = replace(TINY, tracking=TrackingConfig(iterations=2, rays=60, lr_rotation=1e-5, lr_translation=1e-5))
-    astray = replace(rendered, tracking=replace(rendered.tracking, iterations=5, lr_translation=0.02))
+    astray = replace(rendered, tracking=replace(rendered.tracking, iterations=5, lr_translation=0.1))
     for tracker, field in trackers(pair):
-        aligned = tracker.track(seen, GUESS, field, TINY, np.random.default_rng(0)).c2w
-        for config, same in ((rendered, False), (astray, True)):
-            found = tracker.track(seen, GUESS, field, config, np.random.default_rng(0))
+        for config in (rendered, astray):
+            found = tracker.track(seen, GUESS, field, config)
             assert list(found.losses) == list(LOSS_NAMES)
             assert np.isfinite(list(found.losses.values())).all()
-            np.testing.assert_allclose(found.c2w, aligned, atol=1e-6 if same else 1e-4)
-            assert same or not np.array_equal(found.c2w, aligned)
+            np.testing.assert_allclose(found.c2w, TRUE, atol=4e-3)
 
 
 def test_a_frame_without_depth_is_not_tracked(pair):
     seen = look(TRUE, corner(), CAMERA)
     blind = replace(seen, depth=np.zeros_like(seen.depth))
     for tracker, field in trackers(pair):
-        found = tracker.track(blind, GUESS, field, TINY, np.random.default_rng(0))
+        found = tracker.track(blind, GUESS, field, TINY)
         assert (found.fit, found.losses) == (0.0, {})
         np.testing.assert_array_equal(found.c2w, GUESS)
 

@@ -31,7 +31,7 @@ def both_gradients(field, world, live, colour: tl.constexpr, shape: tl.constexpr
     at, fraction = place(field, (x[0], y[0], z[0]), (x[1], y[1], z[1]), shape)
     inside = x[3], y[3], z[3]
     blob, slope = one_blob((x[2], y[2], z[2]), shape)
-    even, odd = gather(field, at, fraction, live, shape)
+    even, odd, _, _ = gather(field, at, fraction, live, shape)
     hidden = layer_one(field, tl.interleave(even, odd), blob, shape)
     sdf, red, green, blue = decode(field, hidden)
     luminance = RED * red + GREEN * green + BLUE * blue

@@ -19,6 +19,7 @@ POSE, TRIAL = tl.constexpr(0), tl.constexpr(16)  # c2w [3, 4], the best one and 
 COUNT, COST, DAMPING, SIZE, DONE = (tl.constexpr(32 + k) for k in range(5))
 EQUATIONS = tl.constexpr(48)  # [8, 8] at the best pose
 ROW = 112
+WIDTH = tl.constexpr(ROW)
 
 
 class Rules(NamedTuple):
@@ -96,9 +97,8 @@ def store_retracted(into, pose, move):
 
 
 @triton.jit
-def step_kernel(before, sums, after, settings, stride, rules: tl.constexpr, first: tl.constexpr):
-    """Write the row ``after`` from ``before`` and the sums at its trial pose: take that pose or leave it, then try the
-    next. first: the sums are those at the best pose itself, and a stage begins."""
+def take(before, sums, after, settings, stride, rules: tl.constexpr, first: tl.constexpr):
+    """See ``step_kernel``."""
     _, kernel, _, _, _, scale, colour_kernel = settings
     row, column = tl.arange(0, 8)[:, None], tl.arange(0, 8)[None, :]
     equations = tl.load(sums + 8 * row + column)
@@ -108,13 +108,13 @@ def step_kernel(before, sums, after, settings, stride, rules: tl.constexpr, firs
     pose, damping = before + POSE, tl.full([], rules.damping, tl.float64)
     done = used < rules.least_used
     if not first:
-        ended, held = tl.load(before + DONE) > 0, tl.load(before + COST)
+        held = tl.load(before + COST)
         size, damping = tl.load(before + SIZE), tl.load(before + DAMPING)
-        gain = (cost < held) & (ended == 0)
+        gain = cost < held
         damping = tl.where(gain, tl.maximum(damping / 3, rules.least_damping), damping * 10)
         settled = (held - cost < rules.settled * held) | (size < rules.still_after_gain)
         hopeless = (damping > rules.most_damping) | (size < rules.still_after_loss)
-        done = ended | tl.where(gain, done | settled, hopeless)
+        done = tl.where(gain, done | settled, hopeless)
         pose = before + tl.where(gain, TRIAL, POSE)
         cost = tl.where(gain, cost, held)
         equations = tl.where(gain, equations, tl.load(before + EQUATIONS + 8 * row + column))
@@ -128,3 +128,17 @@ def step_kernel(before, sums, after, settings, stride, rules: tl.constexpr, firs
     tl.store(after + SIZE, tl.max(tl.where(tl.arange(0, 8) < 6, tl.abs(move), 0.0)))
     tl.store(after + DONE, done.to(tl.float64))
     tl.store(after + EQUATIONS + 8 * row + column, equations)
+
+
+@triton.jit
+def step_kernel(before, sums, after, settings, stride, rules: tl.constexpr, first: tl.constexpr):
+    """Write the row ``after`` from ``before`` and the sums at its trial pose: take that pose or leave it, then try the
+    next; a stage that has ended stays as it is. first: the sums are those at the best pose itself, and a stage
+    begins."""
+    if first:
+        take(before, sums, after, settings, stride, rules, True)
+    elif tl.load(before + DONE) > 0:
+        i = tl.arange(0, 128)
+        tl.store(after + i, tl.load(before + i, i < WIDTH, 0.0), i < WIDTH)
+    else:
+        take(before, sums, after, settings, stride, rules, False)

@@ -106,16 +106,28 @@ def corner(field, x, y, z, live, shape: tl.constexpr):
 
 @triton.jit
 def gather(field, at, fraction, live, shape: tl.constexpr):
-    """Trilinear features of all levels: even [P, width] and odd [P, width]."""
+    """Trilinear features of all levels, even [P, width] and odd [P, width], and the derivatives of either by the
+    fractions (x, y, z)."""
     fx, fy, fz = fraction
     even, odd = tl.zeros_like(fx), tl.zeros_like(fx)
+    even_x, even_y, even_z = even, even, even
+    odd_x, odd_y, odd_z = even, even, even
     for c in tl.static_range(4):
-        share = (fy if c % 2 else 1 - fy) * (fz if c // 2 else 1 - fz)
+        wy = fy if c % 2 else 1 - fy
+        wz = fz if c // 2 else 1 - fz
         even_0, odd_0 = corner(field, at[0][0], at[1][c % 2], at[2][c // 2], live, shape)
         even_1, odd_1 = corner(field, at[0][1], at[1][c % 2], at[2][c // 2], live, shape)
-        even += share * (even_0 + fx * (even_1 - even_0))
-        odd += share * (odd_0 + fx * (odd_1 - odd_0))
-    return even, odd
+        along_even, along_odd = even_1 - even_0, odd_1 - odd_0
+        middle_even, middle_odd = even_0 + fx * along_even, odd_0 + fx * along_odd
+        even += wy * wz * middle_even
+        odd += wy * wz * middle_odd
+        even_x += wy * wz * along_even
+        odd_x += wy * wz * along_odd
+        even_y += (wz if c % 2 else -wz) * middle_even
+        odd_y += (wz if c % 2 else -wz) * middle_odd
+        even_z += (wy if c // 2 else -wy) * middle_even
+        odd_z += (wy if c // 2 else -wy) * middle_odd
+    return even, odd, (even_x, even_y, even_z), (odd_x, odd_y, odd_z)
 
 
 @triton.jit

@@ -25,7 +25,7 @@ from ._gpu_decoders import (
     product,
     through_blob,
 )
-from ._gpu_field import gather, on_box, one_blob, place, pull, scatter
+from ._gpu_field import gather, on_box, one_blob, place, scatter
 
 
 class Points(NamedTuple):
@@ -146,22 +146,29 @@ def hidden_places(i, live):
 
 @triton.jit(do_not_specialize=["total"])
 def values_kernel(
-    field, placed, total, sdf, rgb, features_at, hidden_at, keep: tl.constexpr, shape: tl.constexpr,
-    block: tl.constexpr,
+    field, placed, total, sdf, rgb, features_at, slopes_at, hidden_at, keep: tl.constexpr, keep_features: tl.constexpr,
+    keep_slopes: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
-    """TSDF [N] and colour [N, 3] of points; with ``keep`` their grid features [2, L, N] and the hidden units before the
-    ReLU [N, 64] as well."""
+    """TSDF [N] and colour [N, 3] of points; with ``keep`` the hidden units before the ReLU [N, 64] as well and, where
+    these are wanted too, the grid features [2, L, N] and their derivatives by the fractions within the cells
+    [2, 3, L, N]."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
     x, rest = load_placed(placed, 0, i, live, total), load_placed(placed, 1, i, live, total)
     at, fraction = place(field, x, rest, shape)
-    even, odd = gather(field, at, fraction, live, shape)
+    even, odd, even_slope, odd_slope = gather(field, at, fraction, live, shape)
+    where, there = level_places(i, live, total, shape)
+    further = shape.levels * total
+    if keep and keep_features:
+        tl.store(features_at + where, even, there)
+        tl.store(features_at + further + where, odd, there)
+    if keep and keep_slopes:
+        for axis in tl.static_range(3):
+            tl.store(slopes_at + axis * further + where, even_slope[axis], there)
+            tl.store(slopes_at + (3 + axis) * further + where, odd_slope[axis], there)
     blob, _ = one_blob(load_placed(placed, 2, i, live, total), shape)
     hidden = layer_one(field, tl.interleave(even, odd), blob, shape)
     if keep:
-        where, there = level_places(i, live, total, shape)
-        tl.store(features_at + where, even, there)
-        tl.store(features_at + shape.levels * total + where, odd, there)
         where, there = hidden_places(i, live)
         tl.store(hidden_at + where, hidden, there)
     out = decode(field, hidden)
@@ -176,8 +183,8 @@ def decoders_kernel(
     want_poses: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     """From the gradients of TSDF [N] and of colour before its sigmoid [N, 3] to the decoders' last layer, to the hidden
-    units, which are overwritten by their gradients (both with ``want_params``), to the grid features [2, L, N] and, with
-    ``want_poses``, to the position through the one-blob part, d_world [N, 3]."""
+    units, which are overwritten by their gradients (both with ``want_params``), to the grid features [2, L, N] and,
+    with ``want_poses``, to the position through the one-blob part, d_world [N, 3]."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
     where, there = hidden_places(i, live)
@@ -237,25 +244,38 @@ def add_poses(d_c2w, live, local, pose, gradient):
         tl.atomic_add(d_c2w + 12 * p + 4 * row + column, total, (row < 3) & (column >= 0), sem="relaxed")
 
 
+@triton.jit
+def slid(field, slopes_at, i, live, total, d_even, d_odd, axis: tl.constexpr, shape: tl.constexpr):
+    """Gradient by one world coordinate through the grid features, per metre [P], from theirs [P, width]."""
+    level, further = tl.arange(0, shape.width), shape.levels * total
+    where, there = level_places(i, live, total, shape)
+    inverse = tl.load(field.inverse + 2 * level, level < shape.levels, 0.0)[None, :]
+    even = tl.load(slopes_at + axis * further + where, there, 0.0)
+    odd = tl.load(slopes_at + (3 + axis) * further + where, there, 0.0)
+    return tl.sum((d_even * even + d_odd * odd) * inverse, 1)
+
+
 @triton.jit(do_not_specialize=["total"])
 def grid_kernel(
-    field, points, placed, total, d_features_at, d_world, into, d_c2w, want_params: tl.constexpr,
+    field, points, placed, total, d_features_at, slopes_at, d_world, into, d_c2w, want_params: tl.constexpr,
     want_poses: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
-    """From the gradients of the grid features [2, L, N] to the table and, with the one-blob part of the position's
-    gradient d_world [N, 3], to the poses."""
+    """From the gradients of the grid features [2, L, N] to the table and, with their derivatives [2, 3, L, N] and the
+    one-blob part of the position's gradient d_world [N, 3], to the poses."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
-    x, rest = load_placed(placed, 0, i, live, total), load_placed(placed, 1, i, live, total)
-    at, fraction = place(field, x, rest, shape)
     where, there = level_places(i, live, total, shape)
     d_even = tl.load(d_features_at + where, there, 0.0)
     d_odd = tl.load(d_features_at + shape.levels * total + where, there, 0.0)
     if want_params:
+        x, rest = load_placed(placed, 0, i, live, total), load_placed(placed, 1, i, live, total)
+        at, fraction = place(field, x, rest, shape)
         scatter(field, into.table, at, fraction, d_even, d_odd, live, shape)
     if want_poses:
         inside = load_placed(placed, 3, i, live, total)
-        gx, gy, gz = pull(field, at, fraction, d_even, d_odd, live, shape)
+        gx = slid(field, slopes_at, i, live, total, d_even, d_odd, 0, shape)
+        gy = slid(field, slopes_at, i, live, total, d_even, d_odd, 1, shape)
+        gz = slid(field, slopes_at, i, live, total, d_even, d_odd, 2, shape)
         gradient = (
             (gx + tl.load(d_world + 3 * i, live, 0.0)) * inside[0],
             (gy + tl.load(d_world + 3 * i + 1, live, 0.0)) * inside[1],

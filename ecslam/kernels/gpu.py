@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import weakref
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,6 +39,15 @@ PLACE_BLOCK = 128  # one point a thread
 HIDDEN = 64  # units of both decoders
 RAY_ELEMENTS = 512  # padded samples that one program renders
 PROGRAMS_A_PROCESSOR = 2
+
+
+class Kept(NamedTuple):
+    """What the way back needs of the way forth: see ``values_kernel``."""
+
+    features: Tensor | None
+    slopes: Tensor | None
+    hidden: Tensor
+
 
 _layouts: dict[tuple[int, torch.device], tuple[Tensor, Tensor, Tensor]] = {}
 
@@ -113,16 +123,16 @@ def _place(layout: GridLayout, field: Field, points: Points, from_rays: bool) ->
     return placed
 
 
-def _evaluate(
-    layout: GridLayout, field: Field, placed: Tensor, kept: tuple[Tensor, Tensor] | None = None
-) -> tuple[Tensor, Tensor]:
-    """TSDF [N] and colour [N, 3]; grid features and hidden units go into ``kept`` ([2, L, N], [N, 64]), if given."""
+def _evaluate(layout: GridLayout, field: Field, placed: Tensor, kept: Kept | None = None) -> tuple[Tensor, Tensor]:
+    """TSDF [N] and colour [N, 3]; what is to be ``kept`` goes there."""
     total = placed.shape[1]
     sdf, rgb = placed.new_empty(total), placed.new_empty(total, 3)
+    features, slopes, hidden = kept or (None, None, sdf)
     if total:
         values_kernel[(_blocks(total, VALUES_BLOCK),)](
-            field, placed, total, sdf, rgb, *(kept or (sdf, sdf)),
-            keep=kept is not None, shape=_shape(layout), block=VALUES_BLOCK, num_warps=VALUES_WARPS,
+            field, placed, total, sdf, rgb, hidden if features is None else features,
+            hidden if slopes is None else slopes, hidden, keep=kept is not None, keep_features=features is not None,
+            keep_slopes=slopes is not None, shape=_shape(layout), block=VALUES_BLOCK, num_warps=VALUES_WARPS,
         )  # fmt: skip
     return sdf, rgb
 
@@ -195,8 +205,10 @@ def _step(
     """Add to ``losses``, to ``into`` and to ``d_c2w``, where they are wanted."""
     field, beta, shape = _field(layout, params), _flat(params.beta), _shape(layout)
     total, placed = points.total, _place(layout, field, points, True)
-    features, hidden = beta.new_empty(2, layout.levels, total), beta.new_empty(total, HIDDEN)
-    sdf, rgb = _evaluate(layout, field, placed, (features, hidden))
+    of_features, hidden = (2, layout.levels, total), beta.new_empty(total, HIDDEN)
+    features = None if into is None else beta.new_empty(of_features)
+    slopes = None if d_c2w is None else beta.new_empty(3, *of_features)
+    sdf, rgb = _evaluate(layout, field, placed, Kept(features, slopes, hidden))
     grid, sizes = _ray_grid(targets.rays, targets.samples)
     numbers = tuple(float(getattr(weights, name)) for name in Weights.__dataclass_fields__)
     d_beta = beta if into is None else into.beta
@@ -205,7 +217,7 @@ def _step(
         return
     sink = Into(*(getattr(into or params, name) for name in Into._fields))
     wanted = {"want_params": into is not None, "want_poses": d_c2w is not None}
-    d_features, d_world = torch.empty_like(features), beta.new_empty(total, 3)
+    d_features, d_world = beta.new_empty(of_features), beta.new_empty(total, 3)
     decoders_kernel[(_blocks(total, DECODERS_BLOCK),)](
         field, placed, total, sdf, rgb, hidden, d_features, d_world, sink,
         **wanted, shape=shape, block=DECODERS_BLOCK, num_warps=DECODERS_WARPS,
@@ -217,7 +229,8 @@ def _step(
         )
     unused = losses
     grid_kernel[(_blocks(total, GRID_BLOCK),)](
-        field, points, placed, total, d_features, d_world, sink, unused if d_c2w is None else d_c2w,
+        field, points, placed, total, d_features, unused if slopes is None else slopes, d_world, sink,
+        unused if d_c2w is None else d_c2w,
         **wanted, shape=shape, block=GRID_BLOCK, num_warps=GRID_WARPS,
     )  # fmt: skip
 
