@@ -11,7 +11,7 @@ import pytest
 
 HERE = Path(__file__).parent
 KERNELS = HERE.parent / "ecslam" / "kernels"
-SPILLING = {"gradients_kernel", "align_kernel"}
+SPILLING = {"gradients_kernel", "values_kernel", "decoders_kernel", "weights_kernel", "align_kernel"}
 
 
 def launched():

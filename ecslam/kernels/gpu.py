@@ -31,10 +31,12 @@ from ._gpu_rays import Targets, losses_kernel, render_kernel
 from .poses_gpu import pose_step as pose_step
 
 VALUES_BLOCK, VALUES_WARPS = 64, 4  # sixteen points a warp, which one instruction of a tensor core takes
-DECODERS_BLOCK, DECODERS_WARPS = 64, 4  # likewise
-WEIGHTS_BLOCK, WEIGHTS_WARPS = 64, 4  # likewise
+VALUES_REGISTERS: int | None = 168  # a thread; so that three programs share a processor
+DECODERS_BLOCK, DECODERS_WARPS = 64, 4  # as for the values
+DECODERS_REGISTERS: int | None = None  # as many as there are: with 168 the way to the weights spills them
+WEIGHTS_BLOCK, WEIGHTS_WARPS = 64, 4  # as for the values
 GRID_BLOCK, GRID_WARPS = 32, 8  # no products: two levels a thread, so that many threads share a processor
-ALIGN_BLOCK, ALIGN_WARPS = 64, 4  # points and warps of the gradients in space
+ALIGN_BLOCK, ALIGN_WARPS = 32, 4  # the gradients in space spill registers, and with 64 points far more
 PLACE_BLOCK = 128  # one point a thread
 HIDDEN = 64  # units of both decoders
 RAY_ELEMENTS = 512  # padded samples that one program renders
@@ -133,6 +135,7 @@ def _evaluate(layout: GridLayout, field: Field, placed: Tensor, kept: Kept | Non
             field, placed, total, sdf, rgb, hidden if features is None else features,
             hidden if slopes is None else slopes, hidden, keep=kept is not None, keep_features=features is not None,
             keep_slopes=slopes is not None, shape=_shape(layout), block=VALUES_BLOCK, num_warps=VALUES_WARPS,
+            maxnreg=VALUES_REGISTERS,
         )  # fmt: skip
     return sdf, rgb
 
@@ -220,7 +223,7 @@ def _step(
     d_features, d_world = beta.new_empty(of_features), beta.new_empty(total, 3)
     decoders_kernel[(_blocks(total, DECODERS_BLOCK),)](
         field, placed, total, sdf, rgb, hidden, d_features, d_world, sink,
-        **wanted, shape=shape, block=DECODERS_BLOCK, num_warps=DECODERS_WARPS,
+        **wanted, shape=shape, block=DECODERS_BLOCK, num_warps=DECODERS_WARPS, maxnreg=DECODERS_REGISTERS,
     )  # fmt: skip
     if into is not None:
         blocks = _blocks(total, WEIGHTS_BLOCK)
