@@ -19,7 +19,7 @@ from ecslam.align import align, known_points, stages
 from ecslam.config import AlignConfig, Config, FieldConfig, SamplingConfig, TrackingConfig
 from ecslam.descent import descend
 from ecslam.field import TsdfField, create_field
-from ecslam.kernels import LOSS_NAMES, fusion_gpu, gpu, reference
+from ecslam.kernels import LOSS_NAMES, fusion_gpu, gpu, poses_gpu, reference
 from ecslam.kernels._gpu_descent import COST, COUNT, DAMPING, DONE, EQUATIONS, ROW, SIZE, step_kernel
 from ecslam.kernels.graphs import Recorder
 from ecslam.observed import ObservedVoxels
@@ -332,7 +332,7 @@ def test_a_frame_without_depth_is_not_tracked(pair):
 @pytest.mark.parametrize("fus", [True, False])
 def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     """On the meta device no value can be read at all."""
-    for module in (fusion_gpu, gpu):
+    for module in (fusion_gpu, gpu, poses_gpu):
         launch_nothing(monkeypatch, module)
     meta = torch.device("meta")
     config = replace(TINY, fus=fus, tracking=TrackingConfig(iterations=2, rays=60))
