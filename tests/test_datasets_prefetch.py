@@ -47,7 +47,7 @@ def run(probe: Probe, *args: object, **options: int) -> list[tuple[int, Frame | 
 @pytest.mark.parametrize("ahead", [0, 1, 5, 100])
 def test_frames_come_in_order_and_once(workers: int, ahead: int) -> None:
     probe = Probe(20, delay_s=0.0005)
-    results = run(probe, workers=workers, ahead=ahead)
+    results = run(probe, threads=workers, ahead=ahead)
     assert [index for index, _ in results] == list(range(20))
     assert all(isinstance(frame, Frame) and frame.index == index for index, frame in results)
     assert sorted(probe.read) == list(range(20))
@@ -56,7 +56,7 @@ def test_frames_come_in_order_and_once(workers: int, ahead: int) -> None:
 
 def test_two_workers_read_at_the_same_time() -> None:
     probe = Probe(12, delay_s=0.005)
-    run(probe, workers=2)
+    run(probe, threads=2)
     assert probe.most_together == 2
 
 

@@ -13,11 +13,16 @@ from ..types import Frame, FrameError, Sequence
 MOST_WORKERS = 12
 
 
+def workers() -> int:
+    """How many threads read frames: one a core, within reason."""
+    return min(max(os.cpu_count() or 1, 2), MOST_WORKERS)
+
+
 class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
     """Yields (index, frame) in the order of ``indices`` (default: all), with at most ``ahead`` frames read in advance.
     Reading begins at once.
 
-    workers: threads, by default one a core within reason; ahead: by default two a worker. prepare: what the same
+    threads: by default ``workers()``; ahead: by default two a thread. prepare: what the same
     threads make of each frame.
     Whatever goes wrong with one frame is yielded in its place as a FrameError and the rest goes on. ``close``, or
     dropping the iterator, cancels what has not begun and waits only for the reads under way.
@@ -28,16 +33,16 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
         sequence: Sequence,
         indices: Iterable[int] | None = None,
         *,
-        workers: int | None = None,
+        threads: int | None = None,
         ahead: int | None = None,
         prepare: Callable[[Frame], Frame] = lambda frame: frame,
     ) -> None:
-        workers = workers or min(max(os.cpu_count() or 1, 2), MOST_WORKERS)
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="prefetch")
+        threads = threads or workers()
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="prefetch")
         self._sequence, self._prepare = sequence, prepare
         self._coming = iter(range(len(sequence)) if indices is None else indices)
         self._pending: deque[tuple[int, Future[Frame | FrameError]]] = deque()
-        self._submit(2 * workers if ahead is None else ahead)
+        self._submit(2 * threads if ahead is None else ahead)
 
     def __next__(self) -> tuple[int, Frame | FrameError]:
         self._submit(1)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 
 from ...types import InputError, Sequence
 from ..meshes import ply_bytes
+from ..prefetch import workers
 
 DEPTH_SCALE = 6553.5
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -36,15 +39,23 @@ def write_replica(sequence: Sequence, folder: str | Path, progress: Callable[[in
         mesh = sequence.reference_mesh()
         if mesh is not None:
             (folder / "mesh.ply").write_bytes(ply_bytes(mesh))
-        for i, frame in enumerate(sequence):
-            _save(folder / "results" / f"frame{i:06d}.jpg", frame.color[..., ::-1], JPEG)
-            depth = np.clip(np.rint(frame.depth.astype(np.float64) * DEPTH_SCALE), 0, 65535)
-            _save(folder / "results" / f"depth{i:06d}.png", depth.astype(np.uint16), [])
-            if progress is not None:
-                progress(i + 1, len(sequence))
+        pool = ThreadPoolExecutor(workers(), "export")
+        try:
+            for done, _ in enumerate(pool.map(partial(_write, sequence, folder / "results"), range(len(sequence)))):
+                if progress is not None:
+                    progress(done + 1, len(sequence))
+        finally:
+            pool.shutdown(cancel_futures=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from None
     return folder
+
+
+def _write(sequence: Sequence, folder: Path, index: int) -> None:
+    frame = sequence[index]
+    _save(folder / f"frame{index:06d}.jpg", frame.color[..., ::-1], JPEG)
+    depth = np.clip(np.rint(frame.depth.astype(np.float64) * DEPTH_SCALE), 0, 65535)
+    _save(folder / f"depth{index:06d}.png", depth.astype(np.uint16), [])
 
 
 def _camera(sequence: Sequence) -> str:
