@@ -29,14 +29,15 @@ def cross(a, b):
 
 
 @triton.jit
-def adam(mean, square, rates, gradient, i, p, live, momentum, decay, mean_left, square_left, epsilon):
-    """The move of tangent coordinate i; moments [P, 6] are brought up to date."""
+def adam(mean, square, rates, gradient, i, p, live, keep, add, left, epsilon):
+    """The move of tangent coordinate i; moments [P, 6] are brought up to date. keep, add, left: for either moment its
+    decay, one less that, and what it is divided by (given apart, since numbers come as float32)."""
     at = 6 * p + i
-    m = momentum * tl.load(mean + at, live, 0.0) + (1 - momentum) * gradient
-    s = decay * tl.load(square + at, live, 0.0) + (1 - decay) * gradient * gradient
+    m = keep[0] * tl.load(mean + at, live, 0.0) + add[0] * gradient
+    s = keep[1] * tl.load(square + at, live, 0.0) + add[1] * gradient * gradient
     tl.store(mean + at, m, live)
     tl.store(square + at, s, live)
-    return -tl.load(rates + at, live, 0.0) * (m / mean_left) / (tl.sqrt(s / square_left) + epsilon)
+    return -tl.load(rates + at, live, 0.0) * (m / left[0]) / (tl.sqrt(s / left[1]) + epsilon)
 
 
 @triton.jit
@@ -70,14 +71,14 @@ def put_row(moved, p, i: tl.constexpr, rotation, before, shift, old, about, live
     tl.store(at + 3, before + shift + kept, live)
 
 
-@triton.jit(do_not_specialize=["poses", "mean_left", "square_left"])
+@triton.jit(do_not_specialize=["poses"])
 def pose_kernel(
-    c2w, d_c2w, mean, square, rates, about, moved, poses, momentum, decay, mean_left, square_left, epsilon,
-    turns_about: tl.constexpr, block: tl.constexpr,
+    c2w, d_c2w, mean, square, rates, about, moved, poses, keep, add, left, epsilon, turns_about: tl.constexpr,
+    block: tl.constexpr,
 ):  # fmt: skip
     """Poses float64 [P, 4, 4] after a step from the gradients d_c2w float32 [P, 3, 4], into ``moved``. mean, square,
-    rates: float64 [P, 6]; mean_left, square_left: what Adam divides the moments by; about: float64 [P, 3], in camera
-    coordinates, where ``turns_about`` says that there is one."""
+    rates: float64 [P, 6]; keep, add, left: see ``adam``; about: float64 [P, 3], in camera coordinates, where
+    ``turns_about`` says that there is one."""
     p = tl.program_id(0) * block + tl.arange(0, block)
     live = p < poses
     r0, r1, r2 = three(c2w, p, 16, live), three(c2w + 4, p, 16, live), three(c2w + 8, p, 16, live)
@@ -94,7 +95,7 @@ def pose_kernel(
         centre = three(about, p, 3, live)
         lever = cross((dot(r0, centre), dot(r1, centre), dot(r2, centre)), pull)
         twist = twist[0] - lever[0], twist[1] - lever[1], twist[2] - lever[2]
-    scale = momentum, decay, mean_left, square_left, epsilon
+    scale = keep, add, left, epsilon
     shift = (
         adam(mean, square, rates, pull[0], 0, p, live, *scale),
         adam(mean, square, rates, pull[1], 1, p, live, *scale),

@@ -31,11 +31,11 @@ from ._gpu_rays import Targets, losses_kernel, render_kernel
 from .poses_gpu import pose_step as pose_step
 
 VALUES_BLOCK, VALUES_WARPS = 64, 4  # sixteen points a warp, which one instruction of a tensor core takes
-VALUES_REGISTERS: int | None = 168  # a thread; so that three programs share a processor
+VALUES_REGISTERS = 168  # a thread; so that three programs share a processor
 DECODERS_BLOCK, DECODERS_WARPS = 64, 4  # as for the values
-DECODERS_REGISTERS: int | None = None  # as many as there are: with 168 the way to the weights spills them
+DECODERS_REGISTERS = 168  # for poses alone, likewise; with 168 the way to the weights would spill
 WEIGHTS_BLOCK, WEIGHTS_WARPS = 64, 4  # as for the values
-GRID_BLOCK, GRID_WARPS = 32, 8  # no products: two levels a thread, so that many threads share a processor
+GRID_BLOCK, GRID_WARPS = 32, 4  # no products; timed against 8 warps and 64 points on an H200
 ALIGN_BLOCK, ALIGN_WARPS = 32, 4  # the gradients in space spill registers, and with 64 points far more
 PLACE_BLOCK = 128  # one point a thread
 HIDDEN = 64  # units of both decoders
@@ -221,9 +221,10 @@ def _step(
     sink = Into(*(getattr(into or params, name) for name in Into._fields))
     wanted = {"want_params": into is not None, "want_poses": d_c2w is not None}
     d_features, d_world = beta.new_empty(of_features), beta.new_empty(total, 3)
+    registers = DECODERS_REGISTERS if into is None else None
     decoders_kernel[(_blocks(total, DECODERS_BLOCK),)](
         field, placed, total, sdf, rgb, hidden, d_features, d_world, sink,
-        **wanted, shape=shape, block=DECODERS_BLOCK, num_warps=DECODERS_WARPS, maxnreg=DECODERS_REGISTERS,
+        **wanted, shape=shape, block=DECODERS_BLOCK, num_warps=DECODERS_WARPS, maxnreg=registers,
     )  # fmt: skip
     if into is not None:
         blocks = _blocks(total, WEIGHTS_BLOCK)

@@ -24,10 +24,10 @@ def pose_step(
 ) -> Tensor:
     """See ``reference.pose_step``. Never waits for the device."""
     moved, poses = torch.empty_like(c2w), len(c2w)
+    rest, left = tuple(1 - decay for decay in decays), tuple(1 - decay**count for decay in decays)
     with beside(c2w):
         pose_kernel[(-(-poses // BLOCK),)](
             c2w, d_c2w, mean, square, rates, rates if about is None else about, moved, poses,
-            *decays, *(1 - decay**count for decay in decays), epsilon, turns_about=about is not None, block=BLOCK,
-            num_warps=1,
+            decays, rest, left, epsilon, turns_about=about is not None, block=BLOCK, num_warps=1,
         )  # fmt: skip
     return moved
