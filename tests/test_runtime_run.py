@@ -16,11 +16,12 @@ from runtime_watch import running
 from ecslam.commands import progress_line
 from ecslam.config import load_config, load_preset
 from ecslam.evaluation.trajectory import absolute_error
-from ecslam.messages import Notice, State
+from ecslam.messages import Notice, State, Stop
 from ecslam.runtime import engine as module
 from ecslam.runtime.driven import estimate_mb
 from ecslam.runtime.engine import Engine
 from ecslam.runtime.files import read_lines
+from ecslam.runtime.judge import judge_run
 from ecslam.runtime.tally import Tally
 from ecslam.types import InputError
 
@@ -166,6 +167,20 @@ def test_repeated_and_backward_time_stamps_are_skipped(tmp_path):
     assert (summary["frames"], summary["skipped_frames"], summary["unreadable_frames"]) == (17, 3, [])
     written = np.loadtxt(tmp_path / "trajectory.txt")[:, 0]
     assert (np.diff(written) > 0).all()
+
+
+def test_a_run_that_skipped_repeated_times_is_judged(tmp_path):
+    times = np.arange(20) / 10
+    times[5] = times[4]
+    summary = run(tmp_path, FakeSequence(20, times=times))
+    assert len(np.loadtxt(tmp_path / "groundtruth.txt")) == 19
+    assert judge_run(tmp_path)["ate_rmse_cm"] == pytest.approx(summary["ate_rmse_cm"])
+
+
+def test_a_run_stopped_early_is_judged_by_what_it_did(tmp_path):
+    with running(tmp_path, paused_at=12) as (handle, watch, _):
+        watch.go(Stop(), State.FINISHED)
+    assert judge_run(tmp_path)["ate_rmse_cm"] == pytest.approx(handle.summary["ate_rmse_cm"])
 
 
 def test_a_time_stamp_far_in_the_future_costs_that_frame_only(tmp_path):

@@ -17,6 +17,8 @@ from ..evaluation.trajectory import absolute_error, relative_error
 from ..evaluation.trajectory_io import read_tum
 from ..types import InputError, Mesh
 
+SAME_S = 1e-6
+
 
 def judge_run(
     folder: Path,
@@ -91,8 +93,9 @@ def read_truth(folder: Path, times: NDArray[np.float64]) -> NDArray[np.float64] 
         return None
     found_times, found = read_tum(path)
     truth = np.full((len(times), 4, 4), np.nan)
-    at = np.searchsorted(times, found_times).clip(0, len(times) - 1)
-    truth[at] = found
+    at = np.searchsorted(times, found_times - SAME_S).clip(0, len(times) - 1)
+    same = np.abs(times[at] - found_times) <= SAME_S
+    truth[at[same]] = found[same]
     return truth
 
 

@@ -112,7 +112,7 @@ class Run:
         self.folder.write("run.json", about)
         self.folder.write("config.yaml", configuration.to_yaml(self.config))
         if self.truth is not None:
-            known = np.isfinite(self.truth).all((1, 2))
+            known = np.isfinite(self.truth).all((1, 2)) & self._in_order
             self.folder.write("groundtruth.txt", format_tum(s.timestamps()[known], self.truth[known]))
 
     def _recognise(self) -> None:
