@@ -177,6 +177,13 @@ class Config:
     mapping: MappingConfig = MappingConfig()
     window: WindowConfig = WindowConfig()
 
+    def __post_init__(self) -> None:
+        """Raises InputError where settings contradict each other."""
+        if self.depth_near_m >= self.depth_far_m:
+            raise InputError("depth_near_m must be smaller than depth_far_m")
+        if self.align.to == "none" and self.tracking.iterations == 0:
+            raise InputError("align.to is none and tracking.iterations is 0, so nothing tracks; change one of them")
+
 
 # ---- loading ------------------------------------------------------------------------------------------------------
 
@@ -263,23 +270,21 @@ def load_config(path: Path, base: Config | None = None) -> Config:
 
 def apply_settings(config: Config, settings: list[str]) -> Config:
     """Apply ``key=value`` strings with dotted keys, e.g. ``mapping.iterations=20``. Raises InputError."""
+    values: Any = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: write it as key=value, e.g. --set mapping.iterations=20")
-        value = parse_yaml(text, f"--set {key}")
-        nested: Any = value
+        nested: Any = parse_yaml(text, f"--set {key}")
         for part in reversed(key.strip().split(".")):
             nested = {part: nested}
-        config = apply(config, nested, "--set")
-    return config
+        values = _merged(values, nested)
+    return apply(config, values, "--set")
 
 
 def apply(config: Config, values: Mapping[str, Any], source: str) -> Config:
     """A copy of ``config`` with ``values`` (nested mappings) laid over it. Raises InputError."""
-    result = _apply(config, values, source, "")
-    if result.depth_near_m >= result.depth_far_m:
-        raise InputError(f"{source}: depth_near_m must be smaller than depth_far_m")
+    result: Config = _apply(config, values, source, "")
     if result.field.box is not None and len(result.field.box) != 6:
         raise InputError(f"{source}: field.box takes six numbers: x_min, y_min, z_min, x_max, y_max, z_max (metres)")
     return result
@@ -299,6 +304,13 @@ def to_yaml(config: Config) -> str:
     return yaml.safe_dump(to_dict(config), sort_keys=False)
 
 
+def _merged(under: Any, over: Any) -> Any:
+    """The keys of both, at all depths; where both have a value, that of ``over``."""
+    if not (isinstance(under, Mapping) and isinstance(over, Mapping)):
+        return over
+    return {**under, **{key: _merged(under.get(key), value) for key, value in over.items()}}
+
+
 def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
     if not isinstance(values, Mapping):
         raise InputError(f"{source}: {prefix.rstrip('.') or 'the file'} must hold keys and values, not {_kind(values)}")
@@ -314,7 +326,10 @@ def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
             changes[key] = _apply(current, value, source, f"{path}.")
         else:
             changes[key] = _convert(value, hints[key], by_name[key].metadata, source, path)
-    return dataclasses.replace(node, **changes)
+    try:
+        return dataclasses.replace(node, **changes)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
 
 
 def _convert(value: Any, hint: Any, limits: Mapping[str, Any], source: str, path: str) -> Any:

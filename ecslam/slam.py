@@ -32,7 +32,7 @@ from .samples import seeded
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .tracker import TrackResult, fit, track_adam, track_direct
 from .trajectory import Trajectory
-from .types import Frame, FrameError, InputError, Intrinsics
+from .types import Frame, FrameError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
 from .volume import create_volume
 from .window import random_window, select_window
@@ -60,9 +60,7 @@ class Slam:
         first_pose: NDArray[np.float64] | None = None,
     ) -> None:
         """bounds: scene box [2, 3] metres, derived from the first frame when None. first_pose: c2w [4, 4] of the first
-        frame, the identity when None; it stays fixed. Raises InputError when the configuration leaves nothing that
-        tracks."""
-        _require_tracking(config)
+        frame, the identity when None; it stays fixed."""
         self.config, self.intrinsics = config, intrinsics
         self.device = device or torch.device("cpu")
         self._on_cpu = self.device.type == "cpu"
@@ -342,13 +340,13 @@ class Slam:
         return render_view(self._require_field(), self._kernels, camera, c2w, depth, self.config)
 
     def configure(self, config: Config) -> None:
-        """Change tracking and mapping settings from the next frame on; the field and the volume keep their shape."""
+        """Change tracking and mapping settings from the next frame on; the field and the volume keep their shape.
+
+        Raises InputError where the settings contradict those that are kept."""
         self._apply_pending(block=True)
         kept = self.config
         shape = replace(config.align, to=kept.align.to, voxel_m=kept.align.voxel_m)
-        config = replace(config, field=kept.field, schedule=kept.schedule, seed=kept.seed, align=shape)
-        _require_tracking(config)
-        self.config = config
+        self.config = replace(config, field=kept.field, schedule=kept.schedule, seed=kept.seed, align=shape)
 
     def state(self) -> Arrays:
         """Everything that ``restore`` needs, as arrays nobody writes to afterwards."""
@@ -393,8 +391,3 @@ class Slam:
 
 def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:
     return (pixels.points() @ c2w[:3, :3].T + c2w[:3, 3]).astype(np.float32)
-
-
-def _require_tracking(config: Config) -> None:
-    if config.align.to == "none" and config.tracking.iterations == 0:
-        raise InputError("align.to is none and tracking.iterations is 0, so nothing tracks; change one of them")

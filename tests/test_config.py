@@ -50,7 +50,7 @@ def test_resolved_configuration_reads_back_equal(preset, tmp_path):
         ("truncation_m=.nan", "must be a number"),
         ("mapping=3", "must hold keys"),
         ("field.box=[0, 1]", "six numbers"),
-        ("depth_near_m=9", "smaller than depth_far_m"),
+        ("depth_near_m=9", "--set: depth_near_m must be smaller than depth_far_m"),
         ("seed", "key=value"),
     ],
 )
@@ -58,6 +58,18 @@ def test_wrong_settings_say_what_and_where(setting, says):
     with pytest.raises(InputError, match=says) as error:
         cfg.apply_settings(cfg.Config(), [setting])
     assert "\n" not in str(error.value)
+
+
+def test_something_must_track():
+    live = cfg.load_preset("live")
+    with pytest.raises(InputError, match=r"--set: align.to is none and tracking.iterations is 0"):
+        cfg.apply_settings(live, ["align.to=none"])
+    assert cfg.apply_settings(live, ["align.to=none", "tracking.iterations=8"]).align.to == "none"
+
+
+def test_settings_of_one_group_add_up_and_the_last_of_a_key_counts():
+    c = cfg.apply_settings(cfg.Config(), ["mapping={rays: 50, every: 10}", "mapping.rays=60", "seed=1", "seed=2"])
+    assert (c.mapping.rays, c.mapping.every, c.mapping.iterations, c.seed) == (60, 10, 10, 2)
 
 
 def test_scientific_notation_is_a_number():

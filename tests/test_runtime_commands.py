@@ -178,6 +178,23 @@ def test_tune_and_load_preset_reach_the_engine(tmp_path):
     assert "mapping.iterations = 40 from frame 4 on" in log
 
 
+@pytest.mark.parametrize("command", [LoadPreset("live"), Tune("tracking.iterations", 0)])
+def test_what_would_leave_nothing_that_tracks_is_refused_and_the_run_goes_on(tmp_path, command):
+    config = configuration.apply_settings(configuration.load_preset("lite"), ["align.to=none"])
+    with running(tmp_path, config=config, paused_at=3) as (_, watch, made):
+        assert "nothing tracks" in watch.ask(command).error
+        watch.go(Step(), State.PAUSED)
+        assert made[0].config == config
+
+
+def test_a_request_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("ecslam.runtime.exports.six_pictures", lambda *_: 1 / 0)
+    with running(tmp_path, paused_at=3) as (_, watch, __):
+        watch.ask(RequestPictures())
+        assert "division by zero" in watch.event(Notice).text
+        watch.go(Resume(), State.FINISHED)
+
+
 def test_steps_asked_for_while_one_is_at_work_add_up():
     control = Control(configuration.Config(), lambda _: None, (), ())
     control.begin(configuration.Config(), "fake", 30)

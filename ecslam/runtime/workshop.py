@@ -47,7 +47,7 @@ class Workshop:
         self._jobs.close()
 
     def take_up(self, run: Run, orders: list[tuple[int, Command]]) -> None:
-        """Begin what was ordered; orders taken up together share one frozen map."""
+        """Begin what was ordered; orders taken up together share one frozen map. One that fails is told."""
         frozen: FrozenMap | None = None
         for command_id, command in orders:
             try:
@@ -61,8 +61,8 @@ class Workshop:
                     self._jobs.submit(self._mesh_job(_needed(frozen), command))
                 elif isinstance(command, Export):
                     self._jobs.submit(export_job(run, command, command_id, frozen, self._feed.publish, self._leaving))
-            except (InputError, OSError) as error:
-                self._complain(str(error))
+            except Exception as error:
+                self._complain(str(error) or type(error).__name__)
 
     def _mesh_job(self, frozen: FrozenMap, order: RequestMesh) -> Callable[[], None]:
         return lambda: self._feed.publish(build_mesh(frozen, order.voxel_m, order.max_triangles, self._leaving))
