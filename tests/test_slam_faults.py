@@ -126,6 +126,19 @@ def test_the_box_grows_when_the_camera_leaves_it():
     assert error_cm(slam, 60) < 5
 
 
+def test_a_map_that_began_small_stays_within_its_table():
+    """A camera that first sees a metre of the room gets small cells, too many to be dense in the whole of it."""
+    middle = ROOM.bounds.mean(0)
+    slam = Slam(live(), ROOM.intrinsics, first_pose=ROOM[0].c2w_gt, bounds=np.stack([middle - 0.55, middle + 0.55]))
+    reports = walk(slam, list(range(16)))
+    assert slam.field is not None
+    assert (slam.field.layout.size <= 2**16).all()
+    assert all(r.tracked for r in reports)
+    assert error_cm(slam, 15) < 3
+    sdf, _ = slam.query()
+    assert np.median(np.abs(sdf(slam.surface_points(5000)))) < 0.3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("broken", ["table", "w_sdf"])
 def test_nan_in_the_map_is_rolled_back(broken, monkeypatch):
