@@ -39,6 +39,7 @@ from .window import random_window, select_window
 
 Interrupt = Callable[[], None]
 LEAST_POINTS = 64
+LEAST_SHARE = 0.1
 WORSE = 1.02  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
 RELOCALISE_FROM = 5
 GAP_S = 1.0
@@ -124,8 +125,11 @@ class Slam:
     def _first_frame(self, frame: Frame, interrupt: Interrupt | None) -> StepReport:
         started = time.perf_counter()
         keyframe = make_keyframe(frame, self.intrinsics, self.config, self._rng)
-        if len(keyframe.pixels.points()) == 0:
-            raise FrameError(f"frame {frame.index}: no usable depth, so the map cannot start here")
+        share = len(keyframe.pixels.points()) / (self.config.keyframe_share * frame.depth.size)
+        if share < LEAST_SHARE:
+            raise FrameError(
+                f"frame {frame.index}: {share:.1%} of it has usable depth, too little to start the map with"
+            )
         box = self._bounds
         if box is None:
             box = box_of_points(_world(keyframe.pixels, self._first_pose), self.config.field.box_margin_m)

@@ -11,7 +11,7 @@ from ecslam.config import Config, apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.messages import StepReport
 from ecslam.slam import Slam
-from ecslam.types import Frame
+from ecslam.types import Frame, FrameError
 
 ROOM = open_sequence("synthetic/studio?size=160x120")
 QUICK = ["mapping.first_iterations=60", "mapping.rays=800", "keyframe_share=0.2"]
@@ -192,6 +192,16 @@ def test_a_fixed_box_that_is_too_small_is_said_with_the_share_of_rays_outside():
     assert 2 < share < 100
     assert slam.field is not None
     assert slam.field.layout.box.numpy().tolist() == [[2, 0, 0], [4, 6, 3]]
+
+
+@pytest.mark.parametrize("preset", ["live", "lite"])
+def test_a_first_frame_with_hardly_any_depth_is_skipped(preset):
+    slam = Slam(apply_settings(load_preset(preset), QUICK), ROOM.intrinsics)
+    depth = ROOM[0].depth.copy()
+    depth[:, 8:] = 0
+    with pytest.raises(FrameError, match=r"frame 0: 5.\d% of it has usable depth"):
+        slam.step(replace(ROOM[0], depth=depth))
+    assert slam.field is None
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
