@@ -39,6 +39,7 @@ from ecslam.messages import (
     Stop,
     Tune,
 )
+from ecslam.runtime import workshop
 from ecslam.runtime.checkpoint import load_checkpoint
 from ecslam.runtime.control import Control
 from ecslam.runtime.protocol import EngineHandle
@@ -136,6 +137,29 @@ def test_a_mesh_comes_within_five_seconds_even_during_the_first_mapping(tmp_path
         learnt = watch.until(lambda m: isinstance(m, MeshReady) and m.voxel_m == 0.2)
         assert learnt.frame == 0
         assert np.abs(np.linalg.norm(learnt.mesh.vertices, axis=1) - 1).max() < 0.05
+
+
+def test_a_mesh_of_the_run_before_is_not_shown_after_a_restart(tmp_path, monkeypatch):
+    begun, go = threading.Event(), threading.Event()
+    real = workshop.build_mesh
+
+    def slow(frozen, voxel_m, *options):
+        if voxel_m == 0.3:
+            begun.set()
+            go.wait(10)
+        return real(frozen, voxel_m)
+
+    monkeypatch.setattr(workshop, "build_mesh", slow)
+    with running(tmp_path / "run", paused_at=6) as (engine, watch, _):
+        watch.ask(RequestMesh(0.3))
+        watch.ask(RequestMesh(0.4))
+        assert begun.wait(10)
+        watch.ask(Restart())
+        watch.until(lambda m: engine.run_folder.name == "run-2" and isinstance(m, Snapshot) and m.frame >= 0)
+        since = len(watch.seen)
+        go.set()
+        watch.state(State.FINISHED, since)
+        assert not [m for m in watch.seen[since:] if isinstance(m, MeshReady) and m.voxel_m in (0.3, 0.4)]
 
 
 def test_requested_meshes_keep_to_their_budget(tmp_path):
