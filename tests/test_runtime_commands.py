@@ -122,7 +122,9 @@ def test_leaving_abandons_the_last_mapping_which_can_be_made_up_for(tmp_path, co
         assert time.monotonic() - started < 5
         assert not made[0].finished
     assert json.loads((tmp_path / "r/summary.json").read_text())["frames"] == 3
-    assert not load_checkpoint(tmp_path / "r/checkpoints").meta["finished"]
+    left = load_checkpoint(tmp_path / "r/checkpoints")
+    assert not left.meta["finished"]
+    assert not left.arrays["half_way"]
 
 
 def test_a_mesh_comes_within_five_seconds_even_during_the_first_mapping(tmp_path):

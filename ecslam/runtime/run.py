@@ -336,12 +336,16 @@ class Run:
         self.folder.write("trajectory.txt", format_tum(self.timestamps(), self.poses()))
 
     def end(self, complete: bool, interrupt: Callable[[], None]) -> None:
-        """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock."""
+        """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock.
+
+        A last mapping that ``interrupt`` abandons leaves the map half-way: no checkpoint holds it, and ``resume`` makes
+        it from the one before.
+        """
         if complete and self.slam is not None and self.tally.rows and not self.torn and not self._settled:
             try:
                 self.slam.finish(interrupt)
             except Abandoned:
-                complete = False
+                complete, self.torn = False, True
         self.clock.pause()
         self.tally.wall_s = self.clock.seconds
         self.measure()
