@@ -113,12 +113,12 @@ def test_one_process_at_a_time_writes_a_folder(tmp_path):
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout.readline() == "held\n"
-        for begin in (lambda: RunFolder.create(tmp_path, print), lambda: RunFolder.reopen(tmp_path, 1, print)):
+        for begin in (lambda: RunFolder.create(tmp_path, print), lambda: RunFolder.reopen(tmp_path, print)):
             with pytest.raises(InputError, match=rf"a run is at work there \(process {other.pid}\)"):
                 begin()
         assert (tmp_path / "run.json").exists()
         other.kill()
-    RunFolder.reopen(tmp_path, 1, print).close()
+    RunFolder.reopen(tmp_path, print).close()
 
 
 def test_a_new_run_replaces_the_old_one_and_nothing_else(tmp_path):

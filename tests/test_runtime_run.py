@@ -362,10 +362,13 @@ def test_resume_notes_where_the_sequence_has_moved(tmp_path):
 def test_resume_refuses_a_sequence_that_has_changed(tmp_path, change, says):
     interrupted(tmp_path)
     other = FakeSequence(30)
+    other.name = "moved"
     change(other)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
     with pytest.raises(InputError, match=says) as caught:
         Engine.resume(tmp_path, sequence=other, make=maker())
     assert "\n" not in str(caught.value)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
 
 
 def test_a_run_killed_while_the_last_mesh_was_made_is_finished_without_mapping_again(tmp_path):

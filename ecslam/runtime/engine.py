@@ -194,7 +194,7 @@ class Engine:
         if resumed is None:
             folder = RunFolder.create(plan.out, self._not_saved)
         else:
-            folder = RunFolder.reopen(plan.out, resumed.frame, self._not_saved)
+            folder = RunFolder.reopen(plan.out, self._not_saved)
         run = Run(plan, folder, self._emit, self._make, self._checkpoint_every, resumed)
         coming = range(run.tally.position, len(plan.sequence))
         prepare = preparation(lambda: run.config, plan.device)

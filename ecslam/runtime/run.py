@@ -89,10 +89,13 @@ class Run:
         self.lost_for = 0
         self._settled = False
         if resumed:
-            self._recognise()
+            about = folder.about()
+            self._require_same_camera(about)
             self._settled = bool(resumed.meta["finished"])
             self._build(None, resumed.arrays)
             self._require_same_times()
+            folder.go_on(resumed.frame)
+            folder.write("run.json", about | {"sequence": plan.address})
             self.loops = folder.loops()
         else:
             self._describe()
@@ -115,9 +118,9 @@ class Run:
             known = np.isfinite(self.truth).all((1, 2)) & self._in_order
             self.folder.write("groundtruth.txt", format_tum(s.timestamps()[known], self.truth[known]))
 
-    def _recognise(self) -> None:
-        """Note where the sequence is now. Raises InputError when it is not the one that the run was begun with."""
-        about, now = self.folder.about(), self.plan.sequence.intrinsics
+    def _require_same_camera(self, about: dict[str, Any]) -> None:
+        """Raises InputError when the sequence is not the one that the run was begun with."""
+        now = self.plan.sequence.intrinsics
         for name in CAMERA:
             was, here = about.get(name, np.nan), getattr(now, name)
             if not abs(was - here) < SAME:
@@ -125,8 +128,6 @@ class Run:
                     f"{self.plan.address}: not the sequence that this run was begun with ({name} was {was:g} and is "
                     f"{here:g}); give that one with --sequence"
                 )
-        if about.get("sequence") != self.plan.address:
-            self.folder.write("run.json", about | {"sequence": self.plan.address})
 
     def _require_same_times(self) -> None:
         """Raises InputError when the frames that are done are not those of the sequence."""

@@ -52,9 +52,7 @@ class RunFolder:
         self.path, self._lock = path, lock
         self.not_saved: dict[str, str] = {}
         self._problem = problem
-        for name in ("thumbnails", "meshes"):
-            (path / name).mkdir(exist_ok=True)
-        self._logs = {name: LineLog(path / name) for name in LOGS}
+        self._logs: dict[str, LineLog] = {}
 
     @classmethod
     def create(cls, path: Path, problem: Callable[[str], None], needed_mb: float = NEEDED_MB) -> RunFolder:
@@ -71,21 +69,25 @@ class RunFolder:
             (path / name).unlink(missing_ok=True)
         for name in FOLDERS:
             shutil.rmtree(path / name, ignore_errors=True)
-        return cls(path, problem, lock)
+        folder = cls(path, problem, lock)
+        folder.go_on(0)
+        return folder
 
     @classmethod
-    def reopen(cls, path: Path, position: int, problem: Callable[[str], None]) -> RunFolder:
-        """Go on in ``path`` from frame ``position``: what was logged for it and later frames is dropped.
-
-        Raises InputError as ``create`` does.
-        """
+    def reopen(cls, path: Path, problem: Callable[[str], None]) -> RunFolder:
+        """The folder of a run to resume, which stays as it is until ``go_on``. Raises InputError as ``create`` does."""
         require_space(path, NEEDED_MB)
-        lock = claim(path)
-        remove_temporaries(path)
-        (path / "summary.json").unlink(missing_ok=True)
+        return cls(path, problem, claim(path))
+
+    def go_on(self, position: int) -> None:
+        """Begin to log from frame ``position`` on: what was logged for it and later frames is dropped."""
+        remove_temporaries(self.path)
+        (self.path / "summary.json").unlink(missing_ok=True)
+        for name in ("thumbnails", "meshes"):
+            (self.path / name).mkdir(exist_ok=True)
         for name in LOGS:
-            keep_lines(path / name, lambda line: (line.get("frame") or 0) < position)
-        return cls(path, problem, lock)
+            keep_lines(self.path / name, lambda line: (line.get("frame") or 0) < position)
+            self._logs[name] = LineLog(self.path / name)
 
     def write(self, name: str, data: str | bytes | dict[str, Any]) -> Path | None:
         """Replace a file (a dict becomes JSON); None when it could not be saved."""
