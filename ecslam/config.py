@@ -43,6 +43,15 @@ class FieldConfig:
     box: tuple[float, ...] | None = None
     box_margin_m: float = _number(0.3, 0.0, 10.0)
 
+    def __post_init__(self) -> None:
+        """Raises InputError for a box that is none."""
+        box = self.box
+        if box is not None and (len(box) != 6 or any(box[axis] >= box[axis + 3] for axis in range(3))):
+            raise InputError(
+                f"field.box = {list(box)} takes six numbers: x_min, y_min, z_min, x_max, y_max, z_max (metres), each "
+                "minimum below its maximum"
+            )
+
 
 @dataclass(frozen=True)
 class SamplingConfig:
@@ -92,6 +101,15 @@ class AlignConfig:
     gradient_range: tuple[float, ...] = (0.75, 1.3)
     colour_weight_m: float = _number(0.05, 0.0, 1.0)
     colour_kernel: float = _number(0.2, 1e-3, 10.0)
+
+    def __post_init__(self) -> None:
+        """Raises InputError for lists that mean nothing."""
+        if not self.kernels_m or min(self.kernels_m) <= 0:
+            raise InputError(f"align.kernels_m = {list(self.kernels_m)} takes one or more lengths above 0 (metres)")
+        if len(self.gradient_range) != 2 or not 0 <= self.gradient_range[0] < self.gradient_range[1]:
+            raise InputError(
+                f"align.gradient_range = {list(self.gradient_range)} takes two numbers from 0 on, the lower one first"
+            )
 
 
 @dataclass(frozen=True)
@@ -285,8 +303,6 @@ def apply_settings(config: Config, settings: list[str]) -> Config:
 def apply(config: Config, values: Mapping[str, Any], source: str) -> Config:
     """A copy of ``config`` with ``values`` (nested mappings) laid over it. Raises InputError."""
     result: Config = _apply(config, values, source, "")
-    if result.field.box is not None and len(result.field.box) != 6:
-        raise InputError(f"{source}: field.box takes six numbers: x_min, y_min, z_min, x_max, y_max, z_max (metres)")
     return result
 
 
@@ -346,7 +362,7 @@ def _convert(value: Any, hint: Any, limits: Mapping[str, Any], source: str, path
         return value
     if origin is tuple:
         if not isinstance(value, (list, tuple)) or not all(_is_number(v) for v in value):
-            raise InputError(f"{source}: {path} must be a list of numbers, not {_kind(value)}")
+            raise InputError(f"{source}: {path} must be a list of numbers, not {_kind(value)} {value!r}")
         return tuple(float(v) for v in value)
     wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}[hint]
     ok = {
