@@ -272,17 +272,19 @@ def for_layout(config: Config, layout: str) -> Config:
     return apply(config, parse_yaml(path.read_text("utf-8"), str(path)), str(path)) if path.is_file() else config
 
 
-def load_config(path: Path, base: Config | None = None) -> Config:
-    """Read a YAML file over ``base`` (default: the preset it names, else lite). Raises InputError."""
+def load_config(path: Path, base: Config | None = None, layout: str = "") -> Config:
+    """Read a YAML file over ``base``, or over the preset that it names, with what ``layout`` asks for, where that is
+    another one (without ``base``: else over lite). Raises InputError."""
     try:
         values = parse_yaml(path.read_text("utf-8"), str(path)) or {}
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give --config an existing YAML file") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; give --config a YAML file") from None
-    if base is None:
-        named = values.get("preset", "lite") if isinstance(values, dict) else "lite"
-        base = load_preset(str(named))
+    given = base.preset if base else "lite"
+    named = str(values.get("preset", given)) if isinstance(values, dict) else given
+    if base is None or named != given:
+        base = for_layout(load_preset(named), layout)
     return apply(base, values, str(path))
 
 
@@ -293,6 +295,8 @@ def apply_settings(config: Config, settings: list[str]) -> Config:
         key, equals, text = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: write it as key=value, e.g. --set mapping.iterations=20")
+        if key.strip() == "preset":
+            raise InputError(f"--set {setting}: a preset is more than one setting; choose it with --preset")
         nested: Any = parse_yaml(text, f"--set {key}")
         for part in reversed(key.strip().split(".")):
             nested = {part: nested}

@@ -251,6 +251,12 @@ def test_a_wrong_option(sequence, tmp_path, words, parts):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_file_for_another_preset_than_the_one_asked_for(sequence, tmp_path):
+    (tmp_path / "mine.yaml").write_text("preset: full")
+    words = ["run", sequence, "--headless", "--out", tmp_path / "run", "--config", tmp_path / "mine.yaml"]
+    assert_refused(ecslam(*words, "--preset", "lite"), "mine.yaml", "is for preset full, not lite")
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_gpu_that_is_not_there(sequence, tmp_path):
     outcome = ecslam("run", sequence, "--headless", "--device", "cuda", "--out", tmp_path / "run")

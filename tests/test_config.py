@@ -59,6 +59,7 @@ def test_resolved_configuration_reads_back_equal(preset, tmp_path):
         ("align.gradient_range=[1.3, 0.75]", "align.gradient_range .* the lower one first"),
         ("depth_near_m=9", "--set: depth_near_m must be smaller than depth_far_m"),
         ("seed", "key=value"),
+        ("preset=full", "choose it with --preset"),
     ],
 )
 def test_wrong_settings_say_what_and_where(setting, says):
@@ -81,6 +82,18 @@ def test_settings_of_one_group_add_up_and_the_last_of_a_key_counts():
 
 def test_scientific_notation_is_a_number():
     assert cfg.apply_settings(cfg.Config(), ["mapping.lr_grid=1e-3"]).mapping.lr_grid == 1e-3
+
+
+def test_a_file_starts_from_the_preset_that_it_names(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("preset: full\nmapping: {every: 10}")
+    full = cfg.load_preset("full")
+    wanted = dataclasses.replace(full, mapping=dataclasses.replace(full.mapping, every=10))
+    assert cfg.load_config(path) == wanted
+    assert cfg.load_config(path, cfg.load_preset("live"), "synthetic") == wanted
+    assert cfg.load_config(path, cfg.load_preset("live"), "tum") == cfg.for_layout(wanted, "tum")
+    path.write_text("mapping: {every: 10}")
+    assert cfg.load_config(path, full) == wanted
 
 
 @pytest.mark.parametrize(
