@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -48,6 +48,16 @@ RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
 SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
 
 
+@dataclass(frozen=True)
+class Landed:
+    """What mappings brought that were applied since the last report. window: the keyframes of the last one, as frame
+    indices; losses: its terms, None without any; beside_s: seconds that they took beside tracking."""
+
+    window: tuple[int, ...] = ()
+    losses: dict[str, float] | None = None
+    beside_s: float = 0.0
+
+
 class Slam:
     """The engine: feed it frames, read its trajectory and field. See the paper's figure 2."""
 
@@ -81,7 +91,8 @@ class Slam:
         self._volume = create_volume(self.kernels_name, *lengths, self.device, self._recorder) if fused else None
         self._loops, self._recovery = LoopDetector(), Recovery()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
-        self._pending: Future[MapResult] | None = None
+        self._pending: Future[tuple[MapResult, float]] | None = None
+        self._landed = Landed()
         self._window: NDArray[np.int64] = np.empty(0, np.int64)
         self._frozen: TsdfField | None = None
         self._note, self._outside, self._graphs_failed = "", 0.0, False
@@ -100,13 +111,14 @@ class Slam:
         self.trajectory.append(track.c2w, frame.timestamp, keyframe)
         if not self._recovery.missed:
             self._fuse(frame)
-        tracked = time.perf_counter()
-        losses, loop = track.losses, None
+        tracked, loop, waited_s = time.perf_counter(), None, 0.0
         if keyframe:
             keyframe_now = make_keyframe(frame, self.intrinsics, self.config, self._rng)
             self.keyframes.append(self._shelf.keep(keyframe_now))
         if keyframe and index % self.config.mapping.every == 0:
-            losses, loop = self._map(frame.index, interrupt)
+            waited_s = self._apply_pending(block=True)
+            loop = self._map(frame.index, interrupt)
+        landed, self._landed = self._landed, Landed()
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,
@@ -114,10 +126,10 @@ class Slam:
             tracked=not self._recovery.missed,
             lost=lost,
             is_keyframe=keyframe,
-            window=tuple(self.keyframes[i].frame for i in self._window) if keyframe else (),
-            losses=losses,
+            window=landed.window,
+            losses=track.losses if landed.losses is None else landed.losses,
             track_ms=1e3 * (tracked - started),
-            map_ms=1e3 * (time.perf_counter() - tracked),
+            map_ms=1e3 * (time.perf_counter() - tracked - waited_s + landed.beside_s),
             loop=loop,
             note=self._recovery.note or self._take_note(),
         )
@@ -146,6 +158,7 @@ class Slam:
             self.trajectory, self.keyframes = Trajectory(), []
             raise
         self._apply(result)
+        self._landed = Landed()
         self._fuse(frame)
         return StepReport(
             frame=frame.index,
@@ -243,23 +256,28 @@ class Slam:
 
     # ---- mapping ----------------------------------------------------------------------------------------------------
 
-    def _map(self, frame: int, interrupt: Interrupt | None) -> tuple[dict[str, float], LoopEvent | None]:
+    def _map(self, frame: int, interrupt: Interrupt | None) -> LoopEvent | None:
         """Window, joint optimisation, and an event when old keyframes come back. In ``overlap`` the optimisation runs
         on while tracking goes on, except when a loop closes."""
-        self._apply_pending(block=True)
         self._grow_box()
         self._window = self._choose_window()
         old = self._loops.update(self.trajectory.keyframe_poses(), self.trajectory[-1])
         if self._pool is not None and len(old) == 0:
-            self._pending = self._pool.submit(self._optimise, self._window, self.config.mapping.iterations, None)
-            return {}, None
+            self._pending = self._pool.submit(self._optimise_beside, self._window, self.config.mapping.iterations)
+            return None
         centres, before = self.trajectory.poses()[:, :3, 3].astype(np.float32), self.trajectory[-1]
         result = self._optimise(self._window, self.config.mapping.iterations, interrupt)
         self._apply(result)
         if len(old) == 0:
-            return result.losses, None
+            return None
         met, after = tuple(self.keyframes[i].frame for i in old), sum(result.losses.values())
-        return result.losses, loop_event(frame, met, before, self.trajectory[-1], result.loss_first, after, centres)
+        return loop_event(frame, met, before, self.trajectory[-1], result.loss_first, after, centres)
+
+    def _optimise_beside(self, window: NDArray[np.int64], iterations: int) -> tuple[MapResult, float]:
+        """``_optimise`` on the second thread, and the seconds that it took."""
+        began = time.perf_counter()
+        result = self._optimise(window, iterations, None)
+        return result, time.perf_counter() - began
 
     def _optimise(
         self, window: NDArray[np.int64], iterations: int, interrupt: Interrupt | None, smooth: bool = False
@@ -285,7 +303,9 @@ class Slam:
     def _new_recorder(self) -> Recorder:
         return Recorder(plain=self.kernels_name != "gpu")
 
-    def _apply(self, result: MapResult) -> None:
+    def _apply(self, result: MapResult, beside_s: float = 0.0) -> None:
+        frames = tuple(self.keyframes[i].frame for i in self._window)
+        self._landed = Landed(frames, result.losses, self._landed.beside_s + beside_s)
         if result.failed:
             self._note = "the mapping diverged and was undone"
             return
@@ -294,10 +314,15 @@ class Slam:
         self.trajectory.move_keyframes(self._window, result.c2w)
         self._frozen = self._tracking_field()
 
-    def _apply_pending(self, block: bool) -> None:
-        if self._pending is not None and (block or self._pending.done()):
-            result, self._pending = self._pending.result(), None
-            self._apply(result)
+    def _apply_pending(self, block: bool) -> float:
+        """Apply what the second thread has made; the seconds that were waited for it."""
+        if self._pending is None or not (block or self._pending.done()):
+            return 0.0
+        began = time.perf_counter()
+        (result, took_s), self._pending = self._pending.result(), None
+        waited_s = time.perf_counter() - began
+        self._apply(result, took_s)
+        return waited_s
 
     def _tracking_field(self) -> TsdfField:
         assert self.mapper is not None

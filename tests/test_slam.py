@@ -57,6 +57,19 @@ def test_a_picture_needs_no_uniform_samples():
     assert np.median(np.abs(depth - room[0].depth)[:60]) < 0.2
 
 
+def test_a_mapping_beside_tracking_is_reported_where_it_is_applied():
+    room = open_sequence("synthetic/studio?size=160x120&frames=300")
+    engine = Slam(
+        apply_settings(load_preset("live"), [*SMALL, "schedule=overlap"]), room.intrinsics, first_pose=room[0].c2w_gt
+    )
+    reports = [engine.step(room[i]) for i in range(11)]
+    mapped = [r for r in reports if r.window]
+    assert [r.window for r in mapped] == [(0,), (0, 5)]
+    assert 5 < mapped[1].frame <= 10
+    assert all("colour" in r.losses and r.map_ms > 0 for r in mapped)
+    assert all(r.losses.keys() == {"align_mm"} for r in reports if not r.window)
+
+
 def off_surface(engine):
     """Median distance (metres) that the map gives at measured surface points."""
     points = engine.surface_points(5000)
