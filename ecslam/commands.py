@@ -8,6 +8,7 @@ import tempfile
 import threading
 import webbrowser
 from concurrent.futures import Future, ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from . import datasets
 from .atomic import write_atomic
 from .config import Config
+from .datasets.meshes import NoSurface
 from .datasets.roots import sequences_under
 from .evaluation.trajectory_io import read_tum
 from .messages import Notice, Quit, Snapshot, State
@@ -250,8 +252,12 @@ class Reports:
 
 
 def finish_run(folder: Path, summary: dict[str, Any]) -> None:
-    """Draw the picture of the run, print its figures and where they lie."""
-    picture = draw_picture(folder)
+    """Draw the picture of the run, print its figures and where they lie. A picture that fails is a warning."""
+    picture = None
+    try:
+        picture = draw_picture(folder)
+    except Exception as error:
+        console.print(f"warning: picture.png was not made: {error}", soft_wrap=True, markup=False)
     for name in FIGURES:
         value = summary[name]
         words = "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
@@ -265,18 +271,21 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
 
 
 def draw_picture(folder: Path) -> Path | None:
-    """``picture.png``: mesh and trajectories of a run folder; None when it has no mesh, or an empty one."""
+    """``picture.png``: mesh and trajectories of a run folder; None when it has no mesh, or an empty one. Raises
+    InputError for files that are damaged, and OSError."""
     from .evaluation.plots import plot_run
 
     try:
         mesh = read_mesh(folder / "mesh.ply")
-    except InputError:
+    except NoSurface:
         return None
     times, poses = read_tum(folder / "trajectory.txt")
     truth = read_truth(folder, times)
     summary = json.loads((folder / "summary.json").read_text())
     title = f"{summary['sequence']}, {summary['preset']}: {summary['fps_wall']:.1f} frames/s"
-    plot_run(folder / "picture.png", mesh, poses, truth, title)
+    drawn = BytesIO()
+    plot_run(drawn, mesh, poses, truth, title)
+    write_atomic(folder / "picture.png", drawn.getvalue())
     return folder / "picture.png"
 
 

@@ -324,6 +324,15 @@ def test_why_no_frame_could_be_used(tmp_path):
         run(tmp_path, FakeSequence(4), Behaviour(empty=(0, 1, 2, 3)))
 
 
+def test_without_a_true_pose_of_the_first_frame_the_surface_is_not_judged(tmp_path):
+    sequence = FakeSequence(12, truth=False)
+    sequence.poses_gt = lambda: np.where(np.arange(12)[:, None, None] == 0, np.nan, circle(12))
+    run(tmp_path, sequence)
+    told = []
+    assert "ate_rmse_cm" in judge_run(tmp_path, tell=told.append)
+    assert "the first frame has no true pose" in told[0]
+
+
 def test_frames_without_a_true_pose_are_left_out_of_the_error_and_counted(tmp_path):
     sequence = FakeSequence(12)
     sequence.poses[[2, 7]] = np.nan
