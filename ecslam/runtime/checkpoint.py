@@ -121,7 +121,7 @@ def _read_body(path: Path) -> dict[str, Any]:
 
 def _generations(folder: Path) -> list[Path]:
     """Manifests, newest first."""
-    return sorted(folder.glob("[0-9]*.json"), reverse=True)
+    return sorted((p for p in folder.glob("*.json") if p.stem.isdecimal()), key=lambda p: int(p.stem), reverse=True)
 
 
 def _clean(folder: Path) -> None:
