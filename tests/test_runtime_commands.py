@@ -265,6 +265,23 @@ def test_restart_begins_again_beside_the_first_run(tmp_path):
     assert first["frames"] == 8
 
 
+def test_what_waits_for_the_run_before_a_restart_is_not_done_to_the_new_one(tmp_path):
+    behaviour = Behaviour()
+    with running(tmp_path / "run", paused_at=8, behaviour=behaviour) as (_, watch, made):
+        behaviour.pause_s, asked = 1.0, len(watch.seen)
+        watch.ask(Step())
+        time.sleep(0.2)
+        behaviour.pause_s = 0.0
+        watch.ask(Tune("mapping.iterations", 33))
+        number = watch.ask(Export("trajectory")).command_id
+        watch.ask(Restart())
+        watch.state(State.FINISHED, asked)
+        assert made[1].config.mapping.iterations != 33
+        exported = watch.until(lambda m: isinstance(m, Exported) and m.command_id == number)
+        assert Path(exported.path).parent == tmp_path / "run/exports"
+        assert not [m for m in watch.seen[asked:] if isinstance(m, Notice) and "mapping.iterations" in m.text]
+
+
 def test_a_restart_and_a_preset_keep_what_the_layout_asks_for(tmp_path, monkeypatch):
     (tmp_path / "layouts").mkdir()
     (tmp_path / "layouts" / "fake.yaml").write_text("depth_far_m: 2.5\ntracking:\n  rays: 123\n")
