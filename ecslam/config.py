@@ -135,10 +135,10 @@ class TrackingConfig:
 class MappingConfig:
     """Joint optimisation of the map and the poses in the window.
 
-    newest_share: of the rays, for the newest keyframe. rim: whether the stored pixels reach into the border of
-    ``border_px`` (ours; without them what is only ever seen there stays unmapped). final_iterations: of the map alone,
-    on all keyframes, after the last frame, with the weights ``final_loss`` (ours: more for the tail, which brings out
-    edges and thin things).
+    every: frames from one mapping to the next, which begins with the first keyframe from there on. newest_share: of the
+    rays, for the newest keyframe. rim: whether the stored pixels reach into the border of ``border_px`` (ours; without
+    them what is only ever seen there stays unmapped). final_iterations: of the map alone, on all keyframes, after the
+    last frame, with the weights ``final_loss`` (ours: more for the tail, which brings out edges and thin things).
     """
 
     every: int = _number(5, 1, 1000)

@@ -115,7 +115,7 @@ class Slam:
         if keyframe:
             keyframe_now = make_keyframe(frame, self.intrinsics, self.config, self._rng)
             self.keyframes.append(self._shelf.keep(keyframe_now))
-        if keyframe and index % self.config.mapping.every == 0:
+        if keyframe and index % self.config.mapping.every < self.config.keyframe_every:
             waited_s = self._apply_pending(block=True)
             loop = self._map(frame.index, interrupt)
         landed, self._landed = self._landed, Landed()

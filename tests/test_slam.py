@@ -70,6 +70,15 @@ def test_a_mapping_beside_tracking_is_reported_where_it_is_applied():
     assert all(r.losses.keys() == {"align_mm"} for r in reports if not r.window)
 
 
+@pytest.mark.parametrize(("every", "mapped"), [(1, [0, 5, 10, 15, 20]), (7, [0, 10, 15]), (10, [0, 10, 20])])
+def test_a_mapping_begins_at_the_first_keyframe_when_it_is_due(every, mapped):
+    room = open_sequence("synthetic/studio?size=160x120&frames=300")
+    settings = [*SMALL, "mapping.iterations=1", f"mapping.every={every}"]
+    engine = Slam(apply_settings(load_preset("live"), settings), room.intrinsics, first_pose=room[0].c2w_gt)
+    reports = [engine.step(room[i]) for i in range(21)]
+    assert [r.frame for r in reports if r.window] == mapped
+
+
 def off_surface(engine):
     """Median distance (metres) that the map gives at measured surface points."""
     points = engine.surface_points(5000)
