@@ -29,6 +29,7 @@ from .runtime.files import beside, to_json
 from .runtime.judge import judge_run, read_mesh, read_truth
 from .runtime.mesh_files import mesh_bytes
 from .runtime.meshjobs import MESH_POINTS, FrozenMap, build_mesh
+from .runtime.runfolder import CAMERA, read_about
 from .runtime.signals import quit_on_signals
 from .types import InputError, Sequence
 
@@ -303,20 +304,21 @@ def evaluate(folder: Path) -> None:
 
 
 def remesh(folder: Path, voxel_m: float, out: Path) -> None:
-    """Mesh the map in a run's last checkpoint. Raises InputError for an ending that is no mesh format."""
+    """Mesh the map in a run's last checkpoint. Raises InputError for an ending that is no mesh format, and for a folder
+    without a run."""
     from .slam import Slam
     from .types import Intrinsics
 
     if out.suffix not in (".ply", ".glb", ".obj"):
         raise InputError(f"--out {out}: end the name in .ply, .glb or .obj")
+    checkpoint = load_checkpoint(folder / "checkpoints")
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
-    checkpoint = load_checkpoint(folder / "checkpoints")
     from . import config as configuration
 
     config = configuration.apply(Config(), checkpoint.meta["config"], str(folder))
-    about = json.loads((folder / "run.json").read_text())
-    camera = Intrinsics(*(about[k] for k in ("fx", "fy", "cx", "cy", "width", "height")))
+    about = read_about(folder)
+    camera = Intrinsics(**{name: about[name] for name in CAMERA})
     slam = Slam.restore(config, camera, checkpoint.arrays)
     sdf, color = slam.query()
     with console.status("meshing"):

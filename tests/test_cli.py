@@ -309,6 +309,16 @@ def test_a_folder_that_holds_no_run(command, tmp_path):
     assert_refused(ecslam(command, tmp_path), str(tmp_path))
 
 
+@pytest.mark.parametrize("command", ["mesh", "resume"])
+def test_a_folder_that_is_not_there(command, tmp_path):
+    assert_refused(ecslam(command, tmp_path / "nowhere"), str(tmp_path / "nowhere"), "no such folder")
+
+
+def test_mesh_of_a_run_without_its_description(finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run", ignore=shutil.ignore_patterns("run.json"))
+    assert_refused(ecslam("mesh", folder), "run.json: missing or damaged")
+
+
 def test_a_folder_with_other_things_in_it_is_not_written_to(sequence, tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
     assert_refused(ecslam("run", sequence, "--headless", "--out", tmp_path), str(tmp_path), "--out")

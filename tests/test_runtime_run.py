@@ -280,7 +280,7 @@ def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
         assert frames[0] == frames[1]
     with pytest.raises(InputError, match="is finished"):
         Engine.resume(tmp_path / "cut", sequence=FakeSequence(30))
-    with pytest.raises(InputError, match="no usable checkpoint"):
+    with pytest.raises(InputError, match="none: no such folder"):
         Engine.resume(tmp_path / "none")
 
 

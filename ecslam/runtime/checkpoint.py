@@ -73,7 +73,9 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint, stored: Stored | None 
 
 
 def load_checkpoint(folder: Path) -> Checkpoint:
-    """The newest generation that is whole. Raises InputError when there is none."""
+    """The newest generation in a run's folder of checkpoints that is whole. Raises InputError when there is none."""
+    if not folder.parent.is_dir():
+        raise InputError(f"{folder.parent}: no such folder; give the folder of a run")
     problems = []
     for path in _generations(folder):
         try:

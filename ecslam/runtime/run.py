@@ -27,7 +27,7 @@ from .driven import State as Arrays
 from .memory import return_holes
 from .meshjobs import MESH_POINTS, FrozenMap
 from .pictures import jpeg, shrink
-from .runfolder import RunFolder
+from .runfolder import CAMERA, RunFolder, read_about
 from .summary import summarise
 from .tally import Stopwatch, Tally
 
@@ -38,7 +38,6 @@ THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
 SAME = 1e-6
-CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 GOOD_NEWS = ("relocalised", "recovered")
 
 
@@ -89,7 +88,7 @@ class Run:
         self.lost_for = 0
         self._settled = False
         if resumed:
-            about = folder.about()
+            about = read_about(folder.path)
             self._require_same_camera(about)
             self._settled = bool(resumed.meta["finished"])
             self._build(None, resumed.arrays)
@@ -122,7 +121,7 @@ class Run:
         """Raises InputError when the sequence is not the one that the run was begun with."""
         now = self.plan.sequence.intrinsics
         for name in CAMERA:
-            was, here = about.get(name, np.nan), getattr(now, name)
+            was, here = about[name], getattr(now, name)
             if not abs(was - here) < SAME:
                 raise InputError(
                     f"{self.plan.address}: not the sequence that this run was begun with ({name} was {was:g} and is "

@@ -40,6 +40,7 @@ from .files import LineLog, keep_lines, read_lines, require_space, to_json
 from .folderlock import claim
 
 NEEDED_MB = 500.0
+CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 LOGS = ("metrics.jsonl", "events.jsonl", "keyframes.jsonl")
 FILES = ("run.json", "config.yaml", "trajectory.txt", "groundtruth.txt", "mesh.ply", "summary.json", "picture.png")
 FOLDERS = ("thumbnails", "meshes", "checkpoints")
@@ -150,14 +151,6 @@ class RunFolder:
             self.missing(name, error)
         self._append("keyframes.jsonl", {"frame": frame, "c2w": c2w[:3].reshape(-1), "thumbnail": name})
 
-    def about(self) -> dict[str, Any]:
-        """``run.json``. Raises InputError when it is missing or damaged."""
-        try:
-            about = json.loads((self.path / "run.json").read_text("utf-8"))
-            return dict(about)
-        except (OSError, ValueError, TypeError):
-            raise InputError(f"{self.path / 'run.json'}: missing or damaged; start again with ecslam run") from None
-
     def loops(self) -> list[LoopEvent]:
         """The loop closures in the log."""
         lines = [line for line in read_lines(self.path / "events.jsonl") if line.pop("type", "") == "loop"]
@@ -187,13 +180,24 @@ class RunFolder:
             self._lock.close()
 
 
+def read_about(folder: Path) -> dict[str, Any]:
+    """``run.json`` of a run folder. Raises InputError when it is missing or damaged."""
+    path = folder / "run.json"
+    try:
+        about = dict(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, TypeError):
+        about = {}
+    if not about.keys() >= {"sequence", "frames", "frames_total", *CAMERA}:
+        raise InputError(f"{path}: missing or damaged; start again with ecslam run")
+    return about
+
+
 def _holds_a_run(path: Path) -> bool:
     """Whether a folder holds a run, or nothing but what a run begins with: a recording may have a ``mesh.ply`` and a
     ``groundtruth.txt`` too."""
     try:
-        about = json.loads((path / "run.json").read_text("utf-8"))
-        return "sequence" in about and "frames_total" in about
-    except (OSError, ValueError, TypeError):
+        return bool(read_about(path))
+    except InputError:
         ours = {*LOGS, "run.json", "config.yaml", *FOLDERS}
         found = [p for p in path.iterdir() if not p.name.startswith(".")]
         return all(p.name in ours and not (p.is_dir() and any(p.iterdir())) for p in found)
