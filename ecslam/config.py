@@ -273,8 +273,8 @@ def for_layout(config: Config, layout: str) -> Config:
 
 
 def load_config(path: Path, base: Config | None = None, layout: str = "") -> Config:
-    """Read a YAML file over ``base``, or over the preset that it names, with what ``layout`` asks for, where that is
-    another one (without ``base``: else over lite). Raises InputError."""
+    """Read a YAML file over ``base`` (default: lite); where it names another preset over that one, with what ``layout``
+    asks for. Raises InputError."""
     try:
         values = parse_yaml(path.read_text("utf-8"), str(path)) or {}
     except OSError as error:
