@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from . import config as configuration
-from .types import InputError
+from .types import InputError, Sequence
 
 app = typer.Typer(
     name="ecslam",
@@ -30,7 +30,9 @@ SequenceArgument = Annotated[
     ),
 ]
 Preset = Annotated[str | None, typer.Option(help="lite, full, live, scannet or tum; default: what suits the layout.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="A YAML file laid over the preset.")]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="A YAML file laid over the preset; it may name that.")
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="One setting, e.g. mapping.iterations=20; may be repeated."),
@@ -74,7 +76,7 @@ def run(
     from . import commands
 
     opened = commands.open_sequence(sequence)
-    resolved = resolve_config(preset or opened.preset, opened.layout, config, settings, seed, schedule)
+    resolved = resolve_config(preset, opened, config, settings, seed, schedule)
     folder = out or commands.unused(Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}")
     offered = commands.offered(data or [])
     if not headless:
@@ -273,17 +275,20 @@ def bench_accuracy(
 
 
 def resolve_config(
-    preset: str,
-    layout: str,
+    preset: str | None,
+    sequence: Sequence,
     file: Path | None,
     settings: list[str] | None,
     seed: int | None,
     schedule: str | None,
 ) -> configuration.Config:
-    """Preset, what the layout asks for, then file, then single settings, then seed and schedule. Raises InputError."""
-    resolved = configuration.for_layout(configuration.load_preset(preset), layout)
+    """Preset (the command's, the file's or the sequence's), what the layout asks for, then file, then single settings,
+    then seed and schedule. Raises InputError."""
+    resolved = configuration.for_layout(configuration.load_preset(preset or sequence.preset), sequence.layout)
     if file is not None:
-        resolved = configuration.load_config(file, resolved)
+        resolved = configuration.load_config(file, resolved, sequence.layout)
+        if preset not in (None, resolved.preset):
+            raise InputError(f"{file}: is for preset {resolved.preset}, not {preset}; leave --preset out, or change it")
     direct = [f"{k}={v}" for k, v in (("seed", seed), ("schedule", schedule)) if v is not None]
     return configuration.apply_settings(resolved, [*(settings or []), *direct])
 

@@ -8,6 +8,7 @@ import tempfile
 import threading
 import webbrowser
 from concurrent.futures import Future, ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from . import datasets
 from .atomic import write_atomic
 from .config import Config
+from .datasets.meshes import NoSurface
 from .datasets.roots import sequences_under
 from .evaluation.trajectory_io import read_tum
 from .messages import Notice, Quit, Snapshot, State
@@ -27,6 +29,7 @@ from .runtime.files import beside, to_json
 from .runtime.judge import judge_run, read_mesh, read_truth
 from .runtime.mesh_files import mesh_bytes
 from .runtime.meshjobs import MESH_POINTS, FrozenMap, build_mesh
+from .runtime.runfolder import CAMERA, read_about
 from .runtime.signals import quit_on_signals
 from .types import InputError, Sequence
 
@@ -250,8 +253,12 @@ class Reports:
 
 
 def finish_run(folder: Path, summary: dict[str, Any]) -> None:
-    """Draw the picture of the run, print its figures and where they lie."""
-    picture = draw_picture(folder)
+    """Draw the picture of the run, print its figures and where they lie. A picture that fails is a warning."""
+    picture = None
+    try:
+        picture = draw_picture(folder)
+    except Exception as error:
+        console.print(f"warning: picture.png was not made: {error}", soft_wrap=True, markup=False)
     for name in FIGURES:
         value = summary[name]
         words = "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
@@ -265,18 +272,21 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
 
 
 def draw_picture(folder: Path) -> Path | None:
-    """``picture.png``: mesh and trajectories of a run folder; None when it has no mesh, or an empty one."""
+    """``picture.png``: mesh and trajectories of a run folder; None when it has no mesh, or an empty one. Raises
+    InputError for files that are damaged, and OSError."""
     from .evaluation.plots import plot_run
 
     try:
         mesh = read_mesh(folder / "mesh.ply")
-    except InputError:
+    except NoSurface:
         return None
     times, poses = read_tum(folder / "trajectory.txt")
     truth = read_truth(folder, times)
     summary = json.loads((folder / "summary.json").read_text())
     title = f"{summary['sequence']}, {summary['preset']}: {summary['fps_wall']:.1f} frames/s"
-    plot_run(folder / "picture.png", mesh, poses, truth, title)
+    drawn = BytesIO()
+    plot_run(drawn, mesh, poses, truth, title)
+    write_atomic(folder / "picture.png", drawn.getvalue())
     return folder / "picture.png"
 
 
@@ -294,20 +304,21 @@ def evaluate(folder: Path) -> None:
 
 
 def remesh(folder: Path, voxel_m: float, out: Path) -> None:
-    """Mesh the map in a run's last checkpoint. Raises InputError for an ending that is no mesh format."""
+    """Mesh the map in a run's last checkpoint. Raises InputError for an ending that is no mesh format, and for a folder
+    without a run."""
     from .slam import Slam
     from .types import Intrinsics
 
     if out.suffix not in (".ply", ".glb", ".obj"):
         raise InputError(f"--out {out}: end the name in .ply, .glb or .obj")
+    checkpoint = load_checkpoint(folder / "checkpoints")
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
-    checkpoint = load_checkpoint(folder / "checkpoints")
     from . import config as configuration
 
     config = configuration.apply(Config(), checkpoint.meta["config"], str(folder))
-    about = json.loads((folder / "run.json").read_text())
-    camera = Intrinsics(*(about[k] for k in ("fx", "fy", "cx", "cy", "width", "height")))
+    about = read_about(folder)
+    camera = Intrinsics(**{name: about[name] for name in CAMERA})
     slam = Slam.restore(config, camera, checkpoint.arrays)
     sdf, color = slam.query()
     with console.status("meshing"):

@@ -43,6 +43,15 @@ class FieldConfig:
     box: tuple[float, ...] | None = None
     box_margin_m: float = _number(0.3, 0.0, 10.0)
 
+    def __post_init__(self) -> None:
+        """Raises InputError for a box that is none."""
+        box = self.box
+        if box is not None and (len(box) != 6 or any(box[axis] >= box[axis + 3] for axis in range(3))):
+            raise InputError(
+                f"field.box = {list(box)} takes six numbers: x_min, y_min, z_min, x_max, y_max, z_max (metres), each "
+                "minimum below its maximum"
+            )
+
 
 @dataclass(frozen=True)
 class SamplingConfig:
@@ -93,6 +102,15 @@ class AlignConfig:
     colour_weight_m: float = _number(0.05, 0.0, 1.0)
     colour_kernel: float = _number(0.2, 1e-3, 10.0)
 
+    def __post_init__(self) -> None:
+        """Raises InputError for lists that mean nothing."""
+        if not self.kernels_m or min(self.kernels_m) <= 0:
+            raise InputError(f"align.kernels_m = {list(self.kernels_m)} takes one or more lengths above 0 (metres)")
+        if len(self.gradient_range) != 2 or not 0 <= self.gradient_range[0] < self.gradient_range[1]:
+            raise InputError(
+                f"align.gradient_range = {list(self.gradient_range)} takes two numbers from 0 on, the lower one first"
+            )
+
 
 @dataclass(frozen=True)
 class TrackingConfig:
@@ -117,10 +135,10 @@ class TrackingConfig:
 class MappingConfig:
     """Joint optimisation of the map and the poses in the window.
 
-    newest_share: of the rays, for the newest keyframe. rim: whether the stored pixels reach into the border of
-    ``border_px`` (ours; without them what is only ever seen there stays unmapped). final_iterations: of the map alone,
-    on all keyframes, after the last frame, with the weights ``final_loss`` (ours: more for the tail, which brings out
-    edges and thin things).
+    every: frames from one mapping to the next, which begins with the first keyframe from there on. newest_share: of the
+    rays, for the newest keyframe. rim: whether the stored pixels reach into the border of ``border_px`` (ours; without
+    them what is only ever seen there stays unmapped). final_iterations: of the map alone, on all keyframes, after the
+    last frame, with the weights ``final_loss`` (ours: more for the tail, which brings out edges and thin things).
     """
 
     every: int = _number(5, 1, 1000)
@@ -176,6 +194,13 @@ class Config:
     tracking: TrackingConfig = TrackingConfig()
     mapping: MappingConfig = MappingConfig()
     window: WindowConfig = WindowConfig()
+
+    def __post_init__(self) -> None:
+        """Raises InputError where settings contradict each other."""
+        if self.depth_near_m >= self.depth_far_m:
+            raise InputError("depth_near_m must be smaller than depth_far_m")
+        if self.align.to == "none" and self.tracking.iterations == 0:
+            raise InputError("align.to is none and tracking.iterations is 0, so nothing tracks; change one of them")
 
 
 # ---- loading ------------------------------------------------------------------------------------------------------
@@ -247,41 +272,41 @@ def for_layout(config: Config, layout: str) -> Config:
     return apply(config, parse_yaml(path.read_text("utf-8"), str(path)), str(path)) if path.is_file() else config
 
 
-def load_config(path: Path, base: Config | None = None) -> Config:
-    """Read a YAML file over ``base`` (default: the preset it names, else lite). Raises InputError."""
+def load_config(path: Path, base: Config | None = None, layout: str = "") -> Config:
+    """Read a YAML file over ``base`` (default: lite); where it names another preset over that one, with what ``layout``
+    asks for. Raises InputError."""
     try:
         values = parse_yaml(path.read_text("utf-8"), str(path)) or {}
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give --config an existing YAML file") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; give --config a YAML file") from None
-    if base is None:
-        named = values.get("preset", "lite") if isinstance(values, dict) else "lite"
-        base = load_preset(str(named))
+    given = base.preset if base else "lite"
+    named = str(values.get("preset", given)) if isinstance(values, dict) else given
+    if base is None or named != given:
+        base = for_layout(load_preset(named), layout)
     return apply(base, values, str(path))
 
 
 def apply_settings(config: Config, settings: list[str]) -> Config:
     """Apply ``key=value`` strings with dotted keys, e.g. ``mapping.iterations=20``. Raises InputError."""
+    values: Any = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: write it as key=value, e.g. --set mapping.iterations=20")
-        value = parse_yaml(text, f"--set {key}")
-        nested: Any = value
+        if key.strip() == "preset":
+            raise InputError(f"--set {setting}: a preset is more than one setting; choose it with --preset")
+        nested: Any = parse_yaml(text, f"--set {key}")
         for part in reversed(key.strip().split(".")):
             nested = {part: nested}
-        config = apply(config, nested, "--set")
-    return config
+        values = _merged(values, nested)
+    return apply(config, values, "--set")
 
 
 def apply(config: Config, values: Mapping[str, Any], source: str) -> Config:
     """A copy of ``config`` with ``values`` (nested mappings) laid over it. Raises InputError."""
-    result = _apply(config, values, source, "")
-    if result.depth_near_m >= result.depth_far_m:
-        raise InputError(f"{source}: depth_near_m must be smaller than depth_far_m")
-    if result.field.box is not None and len(result.field.box) != 6:
-        raise InputError(f"{source}: field.box takes six numbers: x_min, y_min, z_min, x_max, y_max, z_max (metres)")
+    result: Config = _apply(config, values, source, "")
     return result
 
 
@@ -299,6 +324,13 @@ def to_yaml(config: Config) -> str:
     return yaml.safe_dump(to_dict(config), sort_keys=False)
 
 
+def _merged(under: Any, over: Any) -> Any:
+    """The keys of both, at all depths; where both have a value, that of ``over``."""
+    if not (isinstance(under, Mapping) and isinstance(over, Mapping)):
+        return over
+    return {**under, **{key: _merged(under.get(key), value) for key, value in over.items()}}
+
+
 def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
     if not isinstance(values, Mapping):
         raise InputError(f"{source}: {prefix.rstrip('.') or 'the file'} must hold keys and values, not {_kind(values)}")
@@ -314,7 +346,10 @@ def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
             changes[key] = _apply(current, value, source, f"{path}.")
         else:
             changes[key] = _convert(value, hints[key], by_name[key].metadata, source, path)
-    return dataclasses.replace(node, **changes)
+    try:
+        return dataclasses.replace(node, **changes)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
 
 
 def _convert(value: Any, hint: Any, limits: Mapping[str, Any], source: str, path: str) -> Any:
@@ -331,7 +366,7 @@ def _convert(value: Any, hint: Any, limits: Mapping[str, Any], source: str, path
         return value
     if origin is tuple:
         if not isinstance(value, (list, tuple)) or not all(_is_number(v) for v in value):
-            raise InputError(f"{source}: {path} must be a list of numbers, not {_kind(value)}")
+            raise InputError(f"{source}: {path} must be a list of numbers, not {_kind(value)} {value!r}")
         return tuple(float(v) for v in value)
     wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}[hint]
     ok = {

@@ -61,7 +61,8 @@ class StepReport:
     """What ``Slam.step`` did with one frame.
 
     losses: weighted terms of the last optimisation (``free_space``, ``centre``, ``tail``, ``depth``, ``colour`` ...).
-    window: frame indices of the keyframes in the last bundle-adjustment window (empty if this frame was not mapped).
+    window: frame indices of the keyframes in the bundle adjustment that was applied with this frame (else empty).
+    map_ms: what that took, in the schedule ``overlap`` beside tracking.
     c2w: float64 [4, 4] estimate for this frame after all corrections. tracked is False when the pose is only predicted.
     """
 

@@ -32,6 +32,7 @@ def pack_field(field: TsdfField) -> Arrays:
     out: Arrays = {f.name: getattr(field.params, f.name).cpu().numpy().copy() for f in fields(FieldParams)}
     for f in fields(GridLayout):
         out[f"layout_{f.name}"] = np.asarray(getattr(field.layout, f.name))
+    out["table_size"] = np.array(field.table_size)
     return out
 
 
@@ -40,7 +41,8 @@ def unpack_field(arrays: Arrays, device: torch.device) -> TsdfField:
     params = FieldParams(*(torch.from_numpy(arrays[f.name].copy()).to(device) for f in fields(FieldParams)))
     parts = {f.name: arrays[f"layout_{f.name}"] for f in fields(GridLayout)}
     bins = int(parts.pop("bins"))
-    return TsdfField(GridLayout(**{k: torch.from_numpy(v.copy()) for k, v in parts.items()}, bins=bins), params)
+    layout = GridLayout(**{k: torch.from_numpy(v.copy()) for k, v in parts.items()}, bins=bins)
+    return TsdfField(layout, params, int(arrays["table_size"]))
 
 
 def pack_keyframes(keyframes: list[Keyframe]) -> Arrays:

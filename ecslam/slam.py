@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,18 +33,29 @@ from .samples import seeded
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .tracker import LEAST_POINTS, HostTracker, Tracker, TrackResult, track_direct
 from .trajectory import Trajectory
-from .types import Frame, FrameError, InputError, Intrinsics
+from .types import Frame, FrameError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
 from .volume import FusedVolume, create_volume
 from .window import random_window, select_window
 
 Interrupt = Callable[[], None]
+LEAST_SHARE = 0.1
 RELOCALISE_FROM = 5
 GAP_S = 1.0
 OUTSIDE_SHARE = 0.01
 BOX_POINTS = 8192  # of a keyframe, looked at to see whether the box holds them
 RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
 SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
+
+
+@dataclass(frozen=True)
+class Landed:
+    """What mappings brought that were applied since the last report. window: the keyframes of the last one, as frame
+    indices; losses: its terms, None without any; beside_s: seconds that they took beside tracking."""
+
+    window: tuple[int, ...] = ()
+    losses: dict[str, float] | None = None
+    beside_s: float = 0.0
 
 
 class Slam:
@@ -60,9 +71,7 @@ class Slam:
         first_pose: NDArray[np.float64] | None = None,
     ) -> None:
         """bounds: scene box [2, 3] metres, derived from the first frame when None. first_pose: c2w [4, 4] of the first
-        frame, the identity when None; it stays fixed. Raises InputError when the configuration leaves nothing that
-        tracks."""
-        _require_tracking(config)
+        frame, the identity when None; it stays fixed."""
         self.config, self.intrinsics = config, intrinsics
         self.device = device or torch.device("cpu")
         self._on_cpu = self.device.type == "cpu"
@@ -86,7 +95,8 @@ class Slam:
         self._trained = 0
         self._loops, self._recovery = LoopDetector(), Recovery()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
-        self._pending: Future[MapResult] | None = None
+        self._pending: Future[tuple[MapResult, float]] | None = None
+        self._landed = Landed()
         self._window: NDArray[np.int64] = np.empty(0, np.int64)
         self._frozen: TsdfField | None = None
         self._note, self._outside, self._graphs_failed = "", 0.0, False
@@ -114,13 +124,14 @@ class Slam:
         self.trajectory.append(track.c2w, frame.timestamp, keyframe)
         if not self._recovery.missed:
             self._fuse(frame)
-        tracked = time.perf_counter()
-        losses, loop = track.losses, None
+        tracked, loop, waited_s = time.perf_counter(), None, 0.0
         if keyframe:
             keyframe_now = make_keyframe(frame, self.intrinsics, self.config)
             self.keyframes.append(self._shelf.keep(keyframe_now))
-        if keyframe and index % self.config.mapping.every == 0:
-            losses, loop = self._map(frame.index, interrupt)
+        if keyframe and index % self.config.mapping.every < self.config.keyframe_every:
+            waited_s = self._apply_pending(block=True)
+            loop = self._map(frame.index, interrupt)
+        landed, self._landed = self._landed, Landed()
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,
@@ -128,10 +139,10 @@ class Slam:
             tracked=not self._recovery.missed,
             lost=lost,
             is_keyframe=keyframe,
-            window=tuple(self.keyframes[i].frame for i in self._window) if keyframe else (),
-            losses=losses,
+            window=landed.window,
+            losses=track.losses if landed.losses is None else landed.losses,
             track_ms=1e3 * (tracked - started),
-            map_ms=1e3 * (time.perf_counter() - tracked),
+            map_ms=1e3 * (time.perf_counter() - tracked - waited_s + landed.beside_s),
             loop=loop,
             note=self._recovery.note or self._take_note(),
         )
@@ -139,8 +150,11 @@ class Slam:
     def _first_frame(self, frame: Frame, interrupt: Interrupt | None) -> StepReport:
         started = time.perf_counter()
         keyframe = make_keyframe(frame, self.intrinsics, self.config)
-        if len(keyframe.pixels.points()) == 0:
-            raise FrameError(f"frame {frame.index}: no usable depth, so the map cannot start here")
+        share = len(keyframe.pixels.points()) / (self.config.keyframe_share * frame.depth.size)
+        if share < LEAST_SHARE:
+            raise FrameError(
+                f"frame {frame.index}: {share:.1%} of it has usable depth, too little to start the map with"
+            )
         box = self._bounds
         if box is None:
             box = box_of_points(_world(keyframe.pixels, self._first_pose), self.config.field.box_margin_m)
@@ -157,6 +171,7 @@ class Slam:
             self.trajectory, self.keyframes = Trajectory(), []
             raise
         self._apply(result)
+        self._landed = Landed()
         self._fuse(frame)
         return StepReport(
             frame=frame.index,
@@ -249,23 +264,28 @@ class Slam:
 
     # ---- mapping ----------------------------------------------------------------------------------------------------
 
-    def _map(self, frame: int, interrupt: Interrupt | None) -> tuple[dict[str, float], LoopEvent | None]:
+    def _map(self, frame: int, interrupt: Interrupt | None) -> LoopEvent | None:
         """Window, joint optimisation, and an event when old keyframes come back. In ``overlap`` the optimisation runs
         on while tracking goes on, except when a loop closes."""
-        self._apply_pending(block=True)
         self._grow_box()
         self._window = self._choose_window()
         old = self._loops.update(self.trajectory.keyframe_poses(), self.trajectory[-1])
         if self._pool is not None and len(old) == 0:
-            self._pending = self._pool.submit(self._optimise, self._window, self.config.mapping.iterations, None)
-            return {}, None
+            self._pending = self._pool.submit(self._optimise_beside, self._window, self.config.mapping.iterations)
+            return None
         centres, before = self.trajectory.poses()[:, :3, 3].astype(np.float32), self.trajectory[-1]
         result = self._optimise(self._window, self.config.mapping.iterations, interrupt)
         self._apply(result)
         if len(old) == 0:
-            return result.losses, None
+            return None
         met, after = tuple(self.keyframes[i].frame for i in old), sum(result.losses.values())
-        return result.losses, loop_event(frame, met, before, self.trajectory[-1], result.loss_first, after, centres)
+        return loop_event(frame, met, before, self.trajectory[-1], result.loss_first, after, centres)
+
+    def _optimise_beside(self, window: NDArray[np.int64], iterations: int) -> tuple[MapResult, float]:
+        """``_optimise`` on the second thread, and the seconds that it took."""
+        began = time.perf_counter()
+        result = self._optimise(window, iterations, None)
+        return result, time.perf_counter() - began
 
     def _optimise(
         self, window: NDArray[np.int64], iterations: int, interrupt: Interrupt | None, smooth: bool = False
@@ -291,7 +311,9 @@ class Slam:
     def _new_recorder(self) -> Recorder:
         return Recorder(plain=self.kernels_name != "gpu")
 
-    def _apply(self, result: MapResult) -> None:
+    def _apply(self, result: MapResult, beside_s: float = 0.0) -> None:
+        frames = tuple(self.keyframes[i].frame for i in self._window)
+        self._landed = Landed(frames, result.losses, self._landed.beside_s + beside_s)
         if result.failed:
             self._note = "the mapping diverged and was undone"
             return
@@ -301,10 +323,15 @@ class Slam:
         self.trajectory.move_keyframes(self._window, result.c2w)
         self._frozen = self._tracking_field()
 
-    def _apply_pending(self, block: bool) -> None:
-        if self._pending is not None and (block or self._pending.done()):
-            result, self._pending = self._pending.result(), None
-            self._apply(result)
+    def _apply_pending(self, block: bool) -> float:
+        """Apply what the second thread has made; the seconds that were waited for it."""
+        if self._pending is None or not (block or self._pending.done()):
+            return 0.0
+        began = time.perf_counter()
+        (result, took_s), self._pending = self._pending.result(), None
+        waited_s = time.perf_counter() - began
+        self._apply(result, took_s)
+        return waited_s
 
     def _tracking_field(self) -> TsdfField:
         assert self.mapper is not None
@@ -352,13 +379,13 @@ class Slam:
         return render_view(self._require_field(), self._kernels, camera, c2w, depth, self.config)
 
     def configure(self, config: Config) -> None:
-        """Change tracking and mapping settings from the next frame on; the field and the volume keep their shape."""
+        """Change tracking and mapping settings from the next frame on; the field and the volume keep their shape.
+
+        Raises InputError where the settings contradict those that are kept."""
         self._apply_pending(block=True)
         kept = self.config
         shape = replace(config.align, to=kept.align.to, voxel_m=kept.align.voxel_m)
-        config = replace(config, field=kept.field, schedule=kept.schedule, seed=kept.seed, align=shape)
-        _require_tracking(config)
-        self.config = config
+        self.config = replace(config, field=kept.field, schedule=kept.schedule, seed=kept.seed, align=shape)
 
     def state(self) -> Arrays:
         """Everything that ``restore`` needs, as arrays nobody writes to afterwards."""
@@ -404,8 +431,3 @@ class Slam:
 
 def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:
     return (pixels.points() @ c2w[:3, :3].T + c2w[:3, 3]).astype(np.float32)
-
-
-def _require_tracking(config: Config) -> None:
-    if config.align.to == "none" and config.tracking.iterations == 0:
-        raise InputError("align.to is none and tracking.iterations is 0, so nothing tracks; change one of them")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .config import Config
 from .field import TsdfField
 from .kernels import Backend, RayBatch
+from .samples import stratified
 from .types import Intrinsics
 
 CHUNK_POINTS = 1 << 18
@@ -55,14 +56,14 @@ def render_view(
     pose = torch.from_numpy(c2w.astype(np.float32))[None].to(field.device)
     measured = torch.from_numpy(depth.reshape(-1)).to(field.device)
     s = config.sampling
-    even = torch.linspace(0.5 / s.uniform, 1 - 0.5 / s.uniform, s.uniform, device=field.device)
+    middle = torch.full((1, s.uniform), 0.5, device=field.device)
     around = torch.linspace(-1, 1, s.near_depth, device=field.device) * s.depth_range_m
     colors, depths = [], []
     for part, near in zip(direction.split(CHUNK_RAYS), measured.split(CHUNK_RAYS), strict=True):
         has = (near > 0)[:, None]
         end = torch.where(has[:, 0], near + s.depth_range_m, torch.full_like(near, config.depth_far_m))
-        z_even = s.near_m + (end - s.near_m)[:, None] * even
-        z_near = torch.where(has, near[:, None] + around, z_even[:, -1:] * (1 + 0.01 * around.abs()))
+        z_even = stratified(torch.full_like(near, s.near_m), end, s.uniform, middle)
+        z_near = torch.where(has, near[:, None] + around, end[:, None] * (1 + 0.01 * around.abs()))
         z = torch.cat([z_even, z_near], 1).clamp_min(1e-3).sort(1).values
         zero = torch.zeros(len(part), device=field.device)
         batch = RayBatch(part, z, zero, torch.zeros_like(part), zero > 0, zero.long())

@@ -100,7 +100,7 @@ class FakeSlam:
         self.config, self.behaviour = config, behaviour
         self.trajectory = FakeTrajectory()
         self.field: FakeField | None = None
-        self.finished = False
+        self.finished = self.half_way = False
 
     def step(self, frame: Frame, interrupt=None) -> StepReport:
         b, first = self.behaviour, self.field is None
@@ -141,10 +141,11 @@ class FakeSlam:
         )
 
     def finish(self, interrupt=None) -> None:
+        self.half_way = True
         for _ in range(self.behaviour.final_interrupts):
             time.sleep(self.behaviour.pause_s)
             interrupt()
-        self.finished = True
+        self.finished, self.half_way = True, False
 
     def surface_points(self, limit) -> np.ndarray:
         directions = np.random.default_rng(0).normal(size=(4000, 3))
@@ -160,7 +161,11 @@ class FakeSlam:
         self.config = config
 
     def state(self) -> dict[str, np.ndarray]:
-        return {"poses": self.trajectory.poses(), "timestamps": np.array(self.trajectory.timestamps)}
+        return {
+            "poses": self.trajectory.poses(),
+            "timestamps": np.array(self.trajectory.timestamps),
+            "half_way": np.array(self.half_way),
+        }
 
 
 def maker(behaviour: Behaviour | None = None):

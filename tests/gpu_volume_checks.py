@@ -18,7 +18,7 @@ from ecslam import volume_gpu
 from ecslam.align import align, known_points, stages
 from ecslam.config import AlignConfig, Config, FieldConfig, SamplingConfig, TrackingConfig
 from ecslam.descent import descend
-from ecslam.field import TsdfField, create_field
+from ecslam.field import create_field
 from ecslam.kernels import LOSS_NAMES, fusion_gpu, gpu, poses_gpu, reference
 from ecslam.kernels._gpu_descent import COST, COUNT, DAMPING, DONE, EQUATIONS, ROW, SIZE, step_kernel
 from ecslam.kernels.graphs import Recorder
@@ -295,7 +295,7 @@ def trackers(pair):
         CAMERA, pair[0], observed, reference, np.random.default_rng(0), torch.Generator(), Recorder(plain=True)
     )
     device = GpuTracker(CAMERA, pair[1], table, gpu, torch.Generator(DEVICE), Recorder())
-    return (host, field), (device, TsdfField(field.layout, moved(field.params, DEVICE)))
+    return (host, field), (device, replace(field, params=moved(field.params, DEVICE)))
 
 
 def test_a_frame_is_tracked_as_on_the_host(pair):
@@ -338,7 +338,7 @@ def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     config = replace(TINY, fus=fus, tracking=TrackingConfig(iterations=2, rays=60))
     _, (tracker, field) = trackers(pair)
     tracker = replace(tracker, observed=ObservedTable(meta))
-    field = TsdfField(field.layout, moved(field.params, meta))
+    field = replace(field, params=moved(field.params, meta))
     blocks, _ = fusion_gpu.allocate(64, *LENGTHS, meta)
     shown = DeviceFrame(torch.zeros(36, 48, 3, dtype=torch.uint8, device=meta), torch.zeros(36, 48, device=meta))
     cells, order = grid_cells(shown, config.align.points, config), grid_cells(shown, config.tracking.rays, config)

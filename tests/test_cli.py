@@ -1,8 +1,10 @@
 """The command line as a person meets it: one small run through every command, and one clear line for a wrong input."""
 
 import contextlib
+import errno
 import io
 import json
+import os
 import shutil
 import socket
 import subprocess
@@ -193,6 +195,13 @@ def test_eval_gives_the_trajectory_where_there_is_no_surface_to_compare(finished
     assert ("/nowhere: no such folder" if lacking == "sequence" else "the map has no surface") in done.out
 
 
+def test_eval_says_at_once_that_a_mesh_is_damaged(finished, tmp_path, monkeypatch):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    (folder / "mesh.ply").write_bytes((folder / "mesh.ply").read_bytes()[:-7])
+    monkeypatch.setattr("ecslam.datasets.files.FileSequence.reference_mesh", pytest.fail)
+    assert_refused(ecslam("eval", folder), "mesh.ply: not a readable mesh", f"make it with: ecslam mesh {folder}")
+
+
 def test_mesh_is_made_again_at_another_size(finished, tmp_path):
     sizes = []
     for voxel in (0.04, 0.08):
@@ -200,6 +209,20 @@ def test_mesh_is_made_again_at_another_size(finished, tmp_path):
         assert done.code == 0, done.err
         sizes.append(len(load_mesh(tmp_path / f"{voxel}.ply").faces))
     assert sizes[0] > 2 * sizes[1] > 0
+
+
+def test_a_full_disk_at_the_picture_is_a_warning(finished, tmp_path, capsys, monkeypatch):
+    folder = shutil.copytree(finished, tmp_path / "run", ignore=shutil.ignore_patterns("picture.png"))
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    commands.finish_run(folder, summary(folder))
+    said = capsys.readouterr().out
+    assert "warning: picture.png was not made: [Errno 28] No space left on device" in said
+    assert str(folder / "summary.json") in said
+    assert not (folder / "picture.png").exists()
 
 
 def test_a_run_without_a_surface_ends_without_a_picture(finished, tmp_path):
@@ -251,6 +274,12 @@ def test_a_wrong_option(sequence, tmp_path, words, parts):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_file_for_another_preset_than_the_one_asked_for(sequence, tmp_path):
+    (tmp_path / "mine.yaml").write_text("preset: full")
+    words = ["run", sequence, "--headless", "--out", tmp_path / "run", "--config", tmp_path / "mine.yaml"]
+    assert_refused(ecslam(*words, "--preset", "lite"), "mine.yaml", "is for preset full, not lite")
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_gpu_that_is_not_there(sequence, tmp_path):
     outcome = ecslam("run", sequence, "--headless", "--device", "cuda", "--out", tmp_path / "run")
@@ -278,6 +307,16 @@ def test_an_automatic_choice_falls_back_to_the_cpu(monkeypatch, capsys, free, de
 @pytest.mark.parametrize("command", ["eval", "mesh", "resume"])
 def test_a_folder_that_holds_no_run(command, tmp_path):
     assert_refused(ecslam(command, tmp_path), str(tmp_path))
+
+
+@pytest.mark.parametrize("command", ["mesh", "resume"])
+def test_a_folder_that_is_not_there(command, tmp_path):
+    assert_refused(ecslam(command, tmp_path / "nowhere"), str(tmp_path / "nowhere"), "no such folder")
+
+
+def test_mesh_of_a_run_without_its_description(finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run", ignore=shutil.ignore_patterns("run.json"))
+    assert_refused(ecslam("mesh", folder), "run.json: missing or damaged")
 
 
 def test_a_folder_with_other_things_in_it_is_not_written_to(sequence, tmp_path):

@@ -49,9 +49,17 @@ def test_resolved_configuration_reads_back_equal(preset, tmp_path):
         ("schedule=fast", "strict, overlap"),
         ("truncation_m=.nan", "must be a number"),
         ("mapping=3", "must hold keys"),
-        ("field.box=[0, 1]", "six numbers"),
-        ("depth_near_m=9", "smaller than depth_far_m"),
+        ("field.box=[0, 1]", r"--set: field.box = \[0.0, 1.0\] takes six numbers"),
+        ("field.box=[0, 0, 0, 1, 0, 1]", "each minimum below its maximum"),
+        ("field.box=[a, 0, 0, 1, 1, 1]", r"field.box must be a list of numbers, not a list \['a', 0"),
+        ("align.kernels_m=[]", "align.kernels_m .* one or more lengths above 0"),
+        ("align.kernels_m=[0.06, -0.02]", "align.kernels_m .* above 0"),
+        ("align.kernels_m=0.06", "align.kernels_m must be a list of numbers, not the number 0.06"),
+        ("align.gradient_range=[0.5]", "align.gradient_range .* takes two numbers"),
+        ("align.gradient_range=[1.3, 0.75]", "align.gradient_range .* the lower one first"),
+        ("depth_near_m=9", "--set: depth_near_m must be smaller than depth_far_m"),
         ("seed", "key=value"),
+        ("preset=full", "choose it with --preset"),
     ],
 )
 def test_wrong_settings_say_what_and_where(setting, says):
@@ -60,8 +68,32 @@ def test_wrong_settings_say_what_and_where(setting, says):
     assert "\n" not in str(error.value)
 
 
+def test_something_must_track():
+    live = cfg.load_preset("live")
+    with pytest.raises(InputError, match=r"--set: align.to is none and tracking.iterations is 0"):
+        cfg.apply_settings(live, ["align.to=none"])
+    assert cfg.apply_settings(live, ["align.to=none", "tracking.iterations=8"]).align.to == "none"
+
+
+def test_settings_of_one_group_add_up_and_the_last_of_a_key_counts():
+    c = cfg.apply_settings(cfg.Config(), ["mapping={rays: 50, every: 10}", "mapping.rays=60", "seed=1", "seed=2"])
+    assert (c.mapping.rays, c.mapping.every, c.mapping.iterations, c.seed) == (60, 10, 10, 2)
+
+
 def test_scientific_notation_is_a_number():
     assert cfg.apply_settings(cfg.Config(), ["mapping.lr_grid=1e-3"]).mapping.lr_grid == 1e-3
+
+
+def test_a_file_starts_from_the_preset_that_it_names(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("preset: full\nmapping: {every: 10}")
+    full = cfg.load_preset("full")
+    wanted = dataclasses.replace(full, mapping=dataclasses.replace(full.mapping, every=10))
+    assert cfg.load_config(path) == wanted
+    assert cfg.load_config(path, cfg.load_preset("live"), "synthetic") == wanted
+    assert cfg.load_config(path, cfg.load_preset("live"), "tum") == cfg.for_layout(wanted, "tum")
+    path.write_text("mapping: {every: 10}")
+    assert cfg.load_config(path, full) == wanted
 
 
 @pytest.mark.parametrize(

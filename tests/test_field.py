@@ -1,5 +1,7 @@
 """The map's laws: growing keeps values, a frozen copy stays put, layouts fill their table exactly."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -16,8 +18,8 @@ def points(count=2000, seed=0):
     return torch.from_numpy(np.random.default_rng(seed).uniform(low, high, (count, 3)).astype(np.float32))
 
 
-def make():
-    return create_field(CONFIG, BOX, 0, torch.device("cpu"))
+def make(config=CONFIG):
+    return create_field(config, BOX, 0, torch.device("cpu"))
 
 
 def test_levels_fill_the_table_without_gap_or_overlap():
@@ -42,7 +44,8 @@ def _lattice(layout, level):
 
 
 def test_growing_keeps_every_value_inside_the_old_box():
-    field = make()
+    field = make(replace(CONFIG, levels=2, base_resolution=4))
+    assert field.layout.dims[:, 0].gt(0).tolist() == [True, False]
     bigger = grow_field(field, np.array([[-3.0, -0.2, -1], [1.5, 4, 2]]))
     again = grow_field(bigger, np.array([[-3.5, -0.2, -2], [1.5, 4, 2]]))
     for grown in (bigger, again):
@@ -53,6 +56,27 @@ def test_growing_keeps_every_value_inside_the_old_box():
         ):
             assert torch.equal(a, b)
     assert torch.equal(again.layout.box, torch.tensor([[-3.5, -0.5, -2], [1.5, 4, 2]]))
+
+
+ROOM = np.array([[-5.0, -5, -1], [5, 5, 2]])
+
+
+def test_a_level_that_outgrows_the_table_is_hashed_and_keeps_what_was_learnt():
+    field = make()
+    grown = grow_field(field, ROOM)
+    old, new = field.layout, grown.layout
+    assert (new.size <= 2**CONFIG.log2_table_size).all()
+    assert table_rows(new) == len(grown.params.table)
+    (changed,) = torch.nonzero((old.dims[:, 0] > 0) & (new.dims[:, 0] == 0)).T
+    assert len(changed) == 3
+    for level in changed.tolist():
+        lattice = _lattice(old, level)
+        place = reference.row(new, level, lattice)
+        before, after = field.params.table[reference.row(old, level, lattice)], grown.params.table[place]
+        kept = (after == before).all(1)
+        assert kept.sum() == len(place.unique()), "one lattice point keeps each row"
+        assert (after.norm(dim=1) >= before.norm(dim=1)).all(), "the one that learnt most"
+        assert kept.float().mean() > 0.6
 
 
 def test_frozen_copy_does_not_follow():

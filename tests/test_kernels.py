@@ -19,7 +19,7 @@ RADIUS, TRUNCATION = 0.8, 0.5
 
 def tiny() -> TsdfField:
     field = make_field(TINY)
-    return TsdfField(field.layout, double(field.params))
+    return replace(field, params=double(field.params))
 
 
 def on_lattice(function) -> TsdfField:
@@ -33,7 +33,8 @@ def on_lattice(function) -> TsdfField:
     table[:, 0] = function(layout.anchor + lattice * layout.voxel[0])
     w_in, w_sdf = torch.zeros_like(p.w_in).double(), torch.zeros_like(p.w_sdf).double()
     w_in[0, 0], w_in[0, 1], w_sdf[0], w_sdf[1] = 1, -1, 1, -1  # relu(f) - relu(-f) = f
-    return TsdfField(layout, FieldParams(table, w_in, w_sdf, torch.zeros_like(p.w_rgb).double(), p.beta.double()))
+    params = FieldParams(table, w_in, w_sdf, torch.zeros_like(p.w_rgb).double(), p.beta.double())
+    return replace(field, params=params)
 
 
 def sphere() -> TsdfField:

@@ -85,8 +85,9 @@ def test_step_with_other_shapes_of_field(kind):
     assert_step(make_field(FIELDS[kind]), *make_rays(130, 17, poses=5))
 
 
-def test_step_after_the_box_grew():
-    field = grow_field(make_field(), BOX * 1.5)
+@pytest.mark.parametrize("log2_table_size", [12, 14])
+def test_step_after_the_box_grew(log2_table_size):
+    field = grow_field(make_field(FieldConfig(log2_table_size=log2_table_size, init_scale=0.1)), BOX * 1.5)
     assert_step(field, *make_rays(100, 20))
 
 

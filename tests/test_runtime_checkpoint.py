@@ -44,6 +44,13 @@ def test_the_newest_two_generations_are_kept(tmp_path):
     assert len(list(tmp_path.glob("*.safetensors"))) == 2
 
 
+def test_a_millionth_frame_is_newer_than_the_one_before(tmp_path):
+    for frame in (999_995, 1_000_000, 1_000_005):
+        save_checkpoint(tmp_path, checkpoint(frame))
+        assert load_checkpoint(tmp_path).frame == frame
+    assert sorted(p.name for p in tmp_path.glob("*.json")) == ["1000000.json", "1000005.json"]
+
+
 def test_lasting_arrays_are_written_once_and_changing_ones_every_time(tmp_path):
     pictures = {f"keyframes.{i}.color": np.full(10_000, i, np.uint8) for i in range(4)}
     stored, written = None, {}

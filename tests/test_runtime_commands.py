@@ -39,6 +39,7 @@ from ecslam.messages import (
     Stop,
     Tune,
 )
+from ecslam.runtime import workshop
 from ecslam.runtime.checkpoint import load_checkpoint
 from ecslam.runtime.control import Control
 from ecslam.runtime.protocol import EngineHandle
@@ -121,7 +122,9 @@ def test_leaving_abandons_the_last_mapping_which_can_be_made_up_for(tmp_path, co
         assert time.monotonic() - started < 5
         assert not made[0].finished
     assert json.loads((tmp_path / "r/summary.json").read_text())["frames"] == 3
-    assert not load_checkpoint(tmp_path / "r/checkpoints").meta["finished"]
+    left = load_checkpoint(tmp_path / "r/checkpoints")
+    assert not left.meta["finished"]
+    assert not left.arrays["half_way"]
 
 
 def test_a_mesh_comes_within_five_seconds_even_during_the_first_mapping(tmp_path):
@@ -136,6 +139,29 @@ def test_a_mesh_comes_within_five_seconds_even_during_the_first_mapping(tmp_path
         learnt = watch.until(lambda m: isinstance(m, MeshReady) and m.voxel_m == 0.2)
         assert learnt.frame == 0
         assert np.abs(np.linalg.norm(learnt.mesh.vertices, axis=1) - 1).max() < 0.05
+
+
+def test_a_mesh_of_the_run_before_is_not_shown_after_a_restart(tmp_path, monkeypatch):
+    begun, go = threading.Event(), threading.Event()
+    real = workshop.build_mesh
+
+    def slow(frozen, voxel_m, *options):
+        if voxel_m == 0.3:
+            begun.set()
+            go.wait(10)
+        return real(frozen, voxel_m)
+
+    monkeypatch.setattr(workshop, "build_mesh", slow)
+    with running(tmp_path / "run", paused_at=6) as (engine, watch, _):
+        watch.ask(RequestMesh(0.3))
+        watch.ask(RequestMesh(0.4))
+        assert begun.wait(10)
+        watch.ask(Restart())
+        watch.until(lambda m: engine.run_folder.name == "run-2" and isinstance(m, Snapshot) and m.frame >= 0)
+        since = len(watch.seen)
+        go.set()
+        watch.state(State.FINISHED, since)
+        assert not [m for m in watch.seen[since:] if isinstance(m, MeshReady) and m.voxel_m in (0.3, 0.4)]
 
 
 def test_requested_meshes_keep_to_their_budget(tmp_path):
@@ -176,6 +202,23 @@ def test_tune_and_load_preset_reach_the_engine(tmp_path):
         assert exported["tracking"]["rays"] == 2000
     log = (tmp_path / "events.jsonl").read_text()
     assert "mapping.iterations = 40 from frame 4 on" in log
+
+
+@pytest.mark.parametrize("command", [LoadPreset("live"), Tune("tracking.iterations", 0)])
+def test_what_would_leave_nothing_that_tracks_is_refused_and_the_run_goes_on(tmp_path, command):
+    config = configuration.apply_settings(configuration.load_preset("lite"), ["align.to=none"])
+    with running(tmp_path, config=config, paused_at=3) as (_, watch, made):
+        assert "nothing tracks" in watch.ask(command).error
+        watch.go(Step(), State.PAUSED)
+        assert made[0].config == config
+
+
+def test_a_request_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("ecslam.runtime.exports.six_pictures", lambda *_: 1 / 0)
+    with running(tmp_path, paused_at=3) as (_, watch, __):
+        watch.ask(RequestPictures())
+        assert "division by zero" in watch.event(Notice).text
+        watch.go(Resume(), State.FINISHED)
 
 
 def test_steps_asked_for_while_one_is_at_work_add_up():
@@ -220,6 +263,23 @@ def test_restart_begins_again_beside_the_first_run(tmp_path):
         assert len(made) == 4
     first = json.loads((out / "summary.json").read_text())
     assert first["frames"] == 8
+
+
+def test_what_waits_for_the_run_before_a_restart_is_not_done_to_the_new_one(tmp_path):
+    behaviour = Behaviour()
+    with running(tmp_path / "run", paused_at=8, behaviour=behaviour) as (_, watch, made):
+        behaviour.pause_s, asked = 1.0, len(watch.seen)
+        watch.ask(Step())
+        time.sleep(0.2)
+        behaviour.pause_s = 0.0
+        watch.ask(Tune("mapping.iterations", 33))
+        number = watch.ask(Export("trajectory")).command_id
+        watch.ask(Restart())
+        watch.state(State.FINISHED, asked)
+        assert made[1].config.mapping.iterations != 33
+        exported = watch.until(lambda m: isinstance(m, Exported) and m.command_id == number)
+        assert Path(exported.path).parent == tmp_path / "run/exports"
+        assert not [m for m in watch.seen[asked:] if isinstance(m, Notice) and "mapping.iterations" in m.text]
 
 
 def test_a_restart_and_a_preset_keep_what_the_layout_asks_for(tmp_path, monkeypatch):

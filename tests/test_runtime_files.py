@@ -16,7 +16,7 @@ from ecslam.messages import Notice
 from ecslam.runtime import files
 from ecslam.runtime.files import LineLog, keep_lines, read_lines, require_space, to_json
 from ecslam.runtime.mesh_files import mesh_bytes
-from ecslam.runtime.runfolder import RunFolder
+from ecslam.runtime.runfolder import CAMERA, RunFolder, read_about
 from ecslam.types import InputError, Mesh
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -100,9 +100,9 @@ def test_a_run_that_ended_before_it_began_is_replaced(tmp_path):
 HOLD = """
 import sys
 from pathlib import Path
-from ecslam.runtime.runfolder import RunFolder
+from ecslam.runtime.runfolder import CAMERA, RunFolder
 folder = RunFolder.create(Path(sys.argv[1]), print)
-folder.write("run.json", {"sequence": "room", "frames_total": 3})
+folder.write("run.json", {"sequence": "room", "frames": "", "frames_total": 3, **dict.fromkeys(CAMERA, 9)})
 print("held", flush=True)
 sys.stdin.read()
 """
@@ -113,17 +113,25 @@ def test_one_process_at_a_time_writes_a_folder(tmp_path):
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout.readline() == "held\n"
-        for begin in (lambda: RunFolder.create(tmp_path, print), lambda: RunFolder.reopen(tmp_path, 1, print)):
-            with pytest.raises(InputError, match=rf"a run is at work there \(process {other.pid}\)"):
+        for begin in (lambda: RunFolder.create(tmp_path, print), lambda: RunFolder.reopen(tmp_path, print)):
+            with pytest.raises(InputError, match=rf"at work there \(process {other.pid}\); .* ecslam run --out"):
                 begin()
         assert (tmp_path / "run.json").exists()
         other.kill()
-    RunFolder.reopen(tmp_path, 1, print).close()
+    RunFolder.reopen(tmp_path, print).close()
+
+
+@pytest.mark.parametrize("content", [None, "{", "[1]", '{"sequence": "room", "frames_total": 3}'])
+def test_a_run_whose_description_is_damaged_is_one_clear_line(tmp_path, content):
+    if content is not None:
+        (tmp_path / "run.json").write_text(content)
+    with pytest.raises(InputError, match=r"run.json: missing or damaged; start again with ecslam run"):
+        read_about(tmp_path)
 
 
 def test_a_new_run_replaces_the_old_one_and_nothing_else(tmp_path):
     folder = RunFolder.create(tmp_path / "r", print)
-    folder.write("run.json", {"sequence": "room", "frames_total": 3})
+    folder.write("run.json", {"sequence": "room", "frames": "", "frames_total": 3, **dict.fromkeys(CAMERA, 9)})
     folder.write("summary.json", {"frames": 1})
     folder.write("picture.png", b"old")
     folder.write("exports/mesh.ply", b"kept")

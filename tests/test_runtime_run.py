@@ -16,11 +16,12 @@ from runtime_watch import running
 from ecslam.commands import progress_line
 from ecslam.config import load_config, load_preset
 from ecslam.evaluation.trajectory import absolute_error
-from ecslam.messages import Notice, State
+from ecslam.messages import Notice, State, Stop
 from ecslam.runtime import engine as module
 from ecslam.runtime.driven import estimate_mb
 from ecslam.runtime.engine import Engine
 from ecslam.runtime.files import read_lines
+from ecslam.runtime.judge import judge_run
 from ecslam.runtime.tally import Tally
 from ecslam.types import InputError
 
@@ -168,6 +169,20 @@ def test_repeated_and_backward_time_stamps_are_skipped(tmp_path):
     assert (np.diff(written) > 0).all()
 
 
+def test_a_run_that_skipped_repeated_times_is_judged(tmp_path):
+    times = np.arange(20) / 10
+    times[5] = times[4]
+    summary = run(tmp_path, FakeSequence(20, times=times))
+    assert len(np.loadtxt(tmp_path / "groundtruth.txt")) == 19
+    assert judge_run(tmp_path)["ate_rmse_cm"] == pytest.approx(summary["ate_rmse_cm"])
+
+
+def test_a_run_stopped_early_is_judged_by_what_it_did(tmp_path):
+    with running(tmp_path, paused_at=12) as (handle, watch, _):
+        watch.go(Stop(), State.FINISHED)
+    assert judge_run(tmp_path)["ate_rmse_cm"] == pytest.approx(handle.summary["ate_rmse_cm"])
+
+
 def test_a_time_stamp_far_in_the_future_costs_that_frame_only(tmp_path):
     times = np.arange(20) / 10
     times[6] += 1e6
@@ -265,7 +280,7 @@ def test_resume_goes_on_where_the_checkpoint_was(tmp_path):
         assert frames[0] == frames[1]
     with pytest.raises(InputError, match="is finished"):
         Engine.resume(tmp_path / "cut", sequence=FakeSequence(30))
-    with pytest.raises(InputError, match="no usable checkpoint"):
+    with pytest.raises(InputError, match="none: no such folder"):
         Engine.resume(tmp_path / "none")
 
 
@@ -309,6 +324,15 @@ def test_why_no_frame_could_be_used(tmp_path):
         run(tmp_path, FakeSequence(4), Behaviour(empty=(0, 1, 2, 3)))
 
 
+def test_without_a_true_pose_of_the_first_frame_the_surface_is_not_judged(tmp_path):
+    sequence = FakeSequence(12, truth=False)
+    sequence.poses_gt = lambda: np.where(np.arange(12)[:, None, None] == 0, np.nan, circle(12))
+    run(tmp_path, sequence)
+    told = []
+    assert "ate_rmse_cm" in judge_run(tmp_path, tell=told.append)
+    assert "the first frame has no true pose" in told[0]
+
+
 def test_frames_without_a_true_pose_are_left_out_of_the_error_and_counted(tmp_path):
     sequence = FakeSequence(12)
     sequence.poses[[2, 7]] = np.nan
@@ -347,10 +371,13 @@ def test_resume_notes_where_the_sequence_has_moved(tmp_path):
 def test_resume_refuses_a_sequence_that_has_changed(tmp_path, change, says):
     interrupted(tmp_path)
     other = FakeSequence(30)
+    other.name = "moved"
     change(other)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
     with pytest.raises(InputError, match=says) as caught:
         Engine.resume(tmp_path, sequence=other, make=maker())
     assert "\n" not in str(caught.value)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
 
 
 def test_a_run_killed_while_the_last_mesh_was_made_is_finished_without_mapping_again(tmp_path):

@@ -41,12 +41,42 @@ def test_a_rendered_pose_that_the_volume_contradicts_is_not_taken(monkeypatch, t
 
 def test_something_must_track():
     room = open_sequence("synthetic/studio?size=160x120&frames=14")
-    config = apply_settings(load_preset("live"), ["align.to=none"])
-    with pytest.raises(InputError, match="nothing tracks"):
-        Slam(config, room.intrinsics)
     engine = Slam(apply_settings(load_preset("lite"), ["align.to=none"]), room.intrinsics)
     with pytest.raises(InputError, match="nothing tracks"):
         engine.configure(load_preset("live"))
+
+
+def test_a_picture_needs_no_uniform_samples():
+    room = open_sequence("synthetic/studio?size=160x120&frames=14")
+    config = apply_settings(load_preset("live"), [*SMALL, "sampling.uniform=0"])
+    engine = Slam(config, room.intrinsics, first_pose=room[0].c2w_gt, bounds=room.bounds)
+    engine.step(room[0])
+    holes = np.where(np.arange(120)[:, None] < 60, room[0].depth, np.float32(0))
+    color, depth = engine.render(engine.trajectory[-1], holes)
+    assert color.shape == (120, 160, 3)
+    assert np.median(np.abs(depth - room[0].depth)[:60]) < 0.2
+
+
+def test_a_mapping_beside_tracking_is_reported_where_it_is_applied():
+    room = open_sequence("synthetic/studio?size=160x120&frames=300")
+    engine = Slam(
+        apply_settings(load_preset("live"), [*SMALL, "schedule=overlap"]), room.intrinsics, first_pose=room[0].c2w_gt
+    )
+    reports = [engine.step(room[i]) for i in range(11)]
+    mapped = [r for r in reports if r.window]
+    assert [r.window for r in mapped] == [(0,), (0, 5)]
+    assert 5 < mapped[1].frame <= 10
+    assert all("colour" in r.losses and r.map_ms > 0 for r in mapped)
+    assert all(r.losses.keys() == {"align_mm"} for r in reports if not r.window)
+
+
+@pytest.mark.parametrize(("every", "mapped"), [(1, [0, 5, 10, 15, 20]), (7, [0, 10, 15]), (10, [0, 10, 20])])
+def test_a_mapping_begins_at_the_first_keyframe_when_it_is_due(every, mapped):
+    room = open_sequence("synthetic/studio?size=160x120&frames=300")
+    settings = [*SMALL, "mapping.iterations=1", f"mapping.every={every}"]
+    engine = Slam(apply_settings(load_preset("live"), settings), room.intrinsics, first_pose=room[0].c2w_gt)
+    reports = [engine.step(room[i]) for i in range(21)]
+    assert [r.frame for r in reports if r.window] == mapped
 
 
 def off_surface(engine):

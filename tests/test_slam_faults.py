@@ -12,7 +12,7 @@ from ecslam.datasets import open_sequence
 from ecslam.messages import StepReport
 from ecslam.slam import Slam
 from ecslam.tracker import HostTracker
-from ecslam.types import Frame
+from ecslam.types import Frame, FrameError
 
 ROOM = open_sequence("synthetic/studio?size=160x120")
 QUICK = ["mapping.first_iterations=60", "mapping.rays=800", "keyframe_share=0.2"]
@@ -127,6 +127,19 @@ def test_the_box_grows_when_the_camera_leaves_it():
     assert error_cm(slam, 60) < 5
 
 
+def test_a_map_that_began_small_stays_within_its_table():
+    """A camera that first sees a metre of the room gets small cells, too many to be dense in the whole of it."""
+    middle = ROOM.bounds.mean(0)
+    slam = Slam(live(), ROOM.intrinsics, first_pose=ROOM[0].c2w_gt, bounds=np.stack([middle - 0.55, middle + 0.55]))
+    reports = walk(slam, list(range(16)))
+    assert slam.field is not None
+    assert (slam.field.layout.size <= 2**16).all()
+    assert all(r.tracked for r in reports)
+    assert error_cm(slam, 15) < 3
+    sdf, _ = slam.query()
+    assert np.median(np.abs(sdf(slam.surface_points(5000)))) < 0.3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("broken", ["table", "w_sdf"])
 def test_nan_in_the_map_is_rolled_back(broken, monkeypatch):
@@ -180,6 +193,16 @@ def test_a_fixed_box_that_is_too_small_is_said_with_the_share_of_rays_outside():
     assert 2 < share < 100
     assert slam.field is not None
     assert slam.field.layout.box.numpy().tolist() == [[2, 0, 0], [4, 6, 3]]
+
+
+@pytest.mark.parametrize("preset", ["live", "lite"])
+def test_a_first_frame_with_hardly_any_depth_is_skipped(preset):
+    slam = Slam(apply_settings(load_preset(preset), QUICK), ROOM.intrinsics)
+    depth = ROOM[0].depth.copy()
+    depth[:, 8:] = 0
+    with pytest.raises(FrameError, match=r"frame 0: 5.\d% of it has usable depth"):
+        slam.step(replace(ROOM[0], depth=depth))
+    assert slam.field is None
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")

@@ -10,8 +10,15 @@ import numpy as np
 from ..types import InputError, Mesh
 
 
-def load_mesh(path: Path) -> Mesh:
-    """Read a triangle mesh (PLY, OBJ, GLB ...) with vertex colours where it has them. Raises InputError."""
+class NoSurface(InputError):
+    """There is no mesh, or one without triangles."""
+
+
+def load_mesh(path: Path, mend: str = "replace it") -> Mesh:
+    """Read a triangle mesh (PLY, OBJ, GLB ...) with vertex colours where it has them.
+
+    mend: what to do about one that is damaged. Raises NoSurface for one without triangles, else InputError.
+    """
     try:
         import trimesh
     except ImportError:
@@ -19,9 +26,11 @@ def load_mesh(path: Path) -> Mesh:
     try:
         mesh: Any = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh raises whatever its many readers do
-        raise InputError(f"{path}: not a readable mesh ({' '.join(str(error).split())}); replace it") from None
+        raise InputError(f"{path}: not a readable mesh ({' '.join(str(error).split())}); {mend}") from None
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
-        raise InputError(f"{path}: a mesh without triangles; replace it")
+        raise NoSurface(f"{path}: a mesh without triangles; {mend}")
+    if not np.isfinite(mesh.vertices).all():
+        raise InputError(f"{path}: not a readable mesh (vertices that are not finite); {mend}")
     colored = mesh.visual.kind == "vertex"
     return Mesh(
         np.asarray(mesh.vertices, np.float32),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,7 +24,9 @@ DPI = 120
 Poses = NDArray[np.float64]
 
 
-def plot_run(path: Path, mesh: Mesh, poses_est: Poses, poses_gt: Poses | None = None, title: str = "") -> None:
+def plot_run(
+    into: Path | IO[bytes], mesh: Mesh, poses_est: Poses, poses_gt: Poses | None = None, title: str = ""
+) -> None:
     """Write a PNG: left the mesh, seen into from above, with the path of the camera; right trajectories and errors.
 
     poses_est: [N, 4, 4] camera-to-world in the world of the mesh. poses_gt: the same for the truth, NaN where unknown,
@@ -42,7 +45,7 @@ def plot_run(path: Path, mesh: Mesh, poses_est: Poses, poses_gt: Poses | None = 
     else:
         _draw_above(figure.add_axes((0.70, 0.43, 0.28, 0.42)), poses_est, poses_gt, error, up)
         _draw_errors(figure.add_axes((0.70, 0.09, 0.28, 0.22)), error)
-    figure.savefig(path, format="png")
+    figure.savefig(into, format="png")
 
 
 def _summary(mesh: Mesh, poses: Poses, error: AbsoluteError | None) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -16,10 +16,14 @@ from .grid import build_layout, grow_layout, regrow, table_rows
 
 @dataclass(frozen=True)
 class TsdfField:
-    """A map: where its cells lie, and the learnt numbers in them (mutated in place by the mapper's optimiser alone)."""
+    """A map: where its cells lie, and the learnt numbers in them (mutated in place by the mapper's optimiser alone).
+
+    table_size: rows of a hashed level; none has more.
+    """
 
     layout: GridLayout
     params: FieldParams
+    table_size: int
 
     @property
     def device(self) -> torch.device:
@@ -35,7 +39,7 @@ class TsdfField:
         """A copy that later mapping does not touch (about a millisecond): ``into``, where that has the same layout and
         is another field, so that what has been recorded over it stays valid."""
         if into is None or into is self or into.layout is not self.layout:
-            return TsdfField(self.layout, map_params(self.params, torch.clone))
+            return replace(self, params=map_params(self.params, torch.clone))
         for f in fields(self.params):
             getattr(into.params, f.name).copy_(getattr(self.params, f.name))
         return into
@@ -62,11 +66,12 @@ def create_field(config: FieldConfig, box: NDArray[np.float64], seed: int, devic
         w_rgb=uniform(HIDDEN, 3, 1 / math.sqrt(HIDDEN)),
         beta=torch.tensor([config.beta]),
     )
-    return TsdfField(layout, map_params(params, lambda t: t.to(device)))
+    return TsdfField(layout, map_params(params, lambda t: t.to(device)), 2**config.log2_table_size)
 
 
 def grow_field(field: TsdfField, box: NDArray[np.float64]) -> TsdfField:
-    """The same map over the union of its box and ``box``: unchanged inside the old box, features zero outside it."""
-    layout = grow_layout(field.layout, box)
-    p = field.params
-    return TsdfField(layout, FieldParams(regrow(field.layout, layout, p.table), p.w_in, p.w_sdf, p.w_rgb, p.beta))
+    """The same map over the union of its box and ``box``: features zero outside the old box and unchanged inside,
+    but for collisions where a level gets too large to be dense."""
+    layout = grow_layout(field.layout, box, field.table_size)
+    table = regrow(field.layout, layout, field.params.table)
+    return replace(field, layout=layout, params=replace(field.params, table=table))

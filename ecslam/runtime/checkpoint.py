@@ -23,7 +23,7 @@ from ..atomic import write_atomic
 from ..types import InputError
 from .files import to_json
 
-VERSION = 4
+VERSION = 5
 GENERATIONS = 2
 MAX_MANIFEST_BYTES = 16 << 20
 LASTING = "keyframes."
@@ -73,7 +73,9 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint, stored: Stored | None 
 
 
 def load_checkpoint(folder: Path) -> Checkpoint:
-    """The newest generation that is whole. Raises InputError when there is none."""
+    """The newest generation in a run's folder of checkpoints that is whole. Raises InputError when there is none."""
+    if not folder.parent.is_dir():
+        raise InputError(f"{folder.parent}: no such folder; give the folder of a run")
     problems = []
     for path in _generations(folder):
         try:
@@ -121,7 +123,7 @@ def _read_body(path: Path) -> dict[str, Any]:
 
 def _generations(folder: Path) -> list[Path]:
     """Manifests, newest first."""
-    return sorted(folder.glob("[0-9]*.json"), reverse=True)
+    return sorted((p for p in folder.glob("*.json") if p.stem.isdecimal()), key=lambda p: int(p.stem), reverse=True)
 
 
 def _clean(folder: Path) -> None:

@@ -209,8 +209,10 @@ class Control:
     # ---- for the engine thread ------------------------------------------------------------------------------------
 
     def begin(self, config: Config, layout: str, total: int, position: int = 0) -> None:
-        """A run over ``total`` frames of a ``layout`` is about to start at ``position``; its commands are taken now."""
+        """A run over ``total`` frames of a ``layout`` is about to start at ``position``; its commands are taken now and
+        what was asked of the run before is dropped."""
         with self._changed:
+            self._work.clear()
             self._layout = layout
             self.config = self._started_with = config
             self.position, self._total = position, total

@@ -18,7 +18,7 @@ from typing import Any
 from .. import config as configuration
 from .. import datasets
 from ..config import Config
-from ..messages import Command, Event, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
+from ..messages import Command, Event, Export, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
 from ..types import Frame, FrameError, InputError, Sequence
 from .ahead import preparation
 from .checkpoint import Checkpoint, load_checkpoint
@@ -171,6 +171,7 @@ class Engine:
 
     def _restart(self) -> Turn:
         command = self._control.take_restart()
+        self._workshop.take_up(self._run, self._control.take_work((Export,)))
         plan = replace(self._plan, out=beside(self._plan.out))
         self.error = self.summary = None
         try:
@@ -194,7 +195,7 @@ class Engine:
         if resumed is None:
             folder = RunFolder.create(plan.out, self._not_saved)
         else:
-            folder = RunFolder.reopen(plan.out, resumed.frame, self._not_saved)
+            folder = RunFolder.reopen(plan.out, self._not_saved)
         run = Run(plan, folder, self._emit, self._make, self._checkpoint_every, resumed)
         coming = range(run.tally.position, len(plan.sequence))
         prepare = preparation(lambda: run.config, plan.sequence.intrinsics, plan.device)

@@ -21,11 +21,14 @@ def require_space(folder: Path, needed_mb: float) -> None:
         (folder / "probe").unlink()
     except OSError as error:
         reason = error.strerror or str(error)
-        raise InputError(f"{folder}: cannot write there ({reason}); choose another folder with --out") from None
+        raise InputError(
+            f"{folder}: cannot write there ({reason}); begin one elsewhere with ecslam run --out"
+        ) from None
     free_mb = shutil.disk_usage(folder).free / 1e6
     if free_mb < needed_mb:
         raise InputError(
-            f"{folder}: {free_mb:.0f} MB free, but a run may need {needed_mb:.0f} MB; make room or choose another --out"
+            f"{folder}: {free_mb:.0f} MB free, but a run may need {needed_mb:.0f} MB; make room, or begin one "
+            "elsewhere with ecslam run --out"
         )
 
 

@@ -34,7 +34,7 @@ def claim(folder: Path) -> IO[str] | None:
         if not isinstance(error, BlockingIOError) or owner == str(os.getpid()):
             return None
         raise InputError(
-            f"{folder}: a run is at work there (process {owner}); stop it, or choose another --out"
+            f"{folder}: a run is at work there (process {owner}); stop it, or begin another with ecslam run --out"
         ) from None
     lock.truncate(0)
     lock.write(str(os.getpid()))

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from .. import datasets
 from ..atomic import write_atomic
-from ..datasets.meshes import load_mesh
+from ..datasets.meshes import NoSurface, load_mesh
 from ..evaluation.trajectory import absolute_error, relative_error
 from ..evaluation.trajectory_io import read_tum
 from ..types import InputError, Mesh
+
+SAME_S = 1e-6
 
 
 def judge_run(
@@ -30,7 +32,7 @@ def judge_run(
     ate_*_cm, rpe_cm, rpe_deg and, where the sequence has a reference mesh, depth_l1_cm, accuracy_cm, completion_cm,
     completion_ratio (per cent). progress: gets the share done in 0..1. surface: False leaves out the latter, which
     take a minute. tell: gets a sentence when some of them are missing. Raises InputError without a finished run or
-    ground truth.
+    ground truth, and for a mesh that is damaged.
     """
     summary_path = folder / "summary.json"
     try:
@@ -58,16 +60,18 @@ def _surface_figures(
     from ..evaluation.report import evaluate_run
 
     try:
+        mesh = read_mesh(folder / "mesh.ply")
+    except NoSurface as error:
+        return {}, f"the trajectory's figures only, for the map has no surface: {error}"
+    if not np.isfinite(truth[0]).all():
+        return {}, "the trajectory's figures only, for the first frame has no true pose: the map lies in its own world"
+    try:
         sequence = datasets.select_frames(datasets.open_sequence(about["sequence"]), about["frames"])
         reference = sequence.reference_mesh()
     except InputError as error:
         return {}, f"the trajectory's figures only, for the reference mesh is out of reach: {error}"
     if reference is None:
         return {}, "the trajectory's figures only, for the sequence has no reference mesh"
-    try:
-        mesh = read_mesh(folder / "mesh.ply")
-    except InputError as error:
-        return {}, f"the trajectory's figures only, for the map has no surface: {error}"
     found = evaluate_run(mesh, reference, sequence.intrinsics, truth, progress=progress)
     missing = ", ".join(name for name, value in found.items() if value is None)
     note = f"without {missing}, for nothing of the map's surface was in view" if missing else ""
@@ -91,13 +95,15 @@ def read_truth(folder: Path, times: NDArray[np.float64]) -> NDArray[np.float64] 
         return None
     found_times, found = read_tum(path)
     truth = np.full((len(times), 4, 4), np.nan)
-    at = np.searchsorted(times, found_times).clip(0, len(times) - 1)
-    truth[at] = found
+    at = np.searchsorted(times, found_times - SAME_S).clip(0, len(times) - 1)
+    same = np.abs(times[at] - found_times) <= SAME_S
+    truth[at[same]] = found[same]
     return truth
 
 
 def read_mesh(path: Path) -> Mesh:
-    """A mesh file of ours. Raises InputError."""
+    """A mesh file of ours. Raises NoSurface where there is none or an empty one, InputError for a damaged one."""
+    mend = f"make it with: ecslam mesh {path.parent}"
     if not path.is_file():
-        raise InputError(f"{path}: no mesh here; make it with: ecslam mesh {path.parent}")
-    return load_mesh(path)
+        raise NoSurface(f"{path}: no mesh here; {mend}")
+    return load_mesh(path, mend)

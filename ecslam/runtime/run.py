@@ -27,7 +27,7 @@ from .driven import State as Arrays
 from .memory import return_holes
 from .meshjobs import MESH_POINTS, FrozenMap
 from .pictures import jpeg, shrink
-from .runfolder import RunFolder
+from .runfolder import CAMERA, RunFolder, read_about
 from .summary import summarise
 from .tally import Stopwatch, Tally
 
@@ -38,7 +38,6 @@ THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
 SAME = 1e-6
-CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 GOOD_NEWS = ("relocalised", "recovered")
 
 
@@ -89,10 +88,13 @@ class Run:
         self.lost_for = 0
         self._settled = False
         if resumed:
-            self._recognise()
+            about = read_about(folder.path)
+            self._require_same_camera(about)
             self._settled = bool(resumed.meta["finished"])
             self._build(None, resumed.arrays)
             self._require_same_times()
+            folder.go_on(resumed.frame)
+            folder.write("run.json", about | {"sequence": plan.address})
             self.loops = folder.loops()
         else:
             self._describe()
@@ -112,21 +114,19 @@ class Run:
         self.folder.write("run.json", about)
         self.folder.write("config.yaml", configuration.to_yaml(self.config))
         if self.truth is not None:
-            known = np.isfinite(self.truth).all((1, 2))
+            known = np.isfinite(self.truth).all((1, 2)) & self._in_order
             self.folder.write("groundtruth.txt", format_tum(s.timestamps()[known], self.truth[known]))
 
-    def _recognise(self) -> None:
-        """Note where the sequence is now. Raises InputError when it is not the one that the run was begun with."""
-        about, now = self.folder.about(), self.plan.sequence.intrinsics
+    def _require_same_camera(self, about: dict[str, Any]) -> None:
+        """Raises InputError when the sequence is not the one that the run was begun with."""
+        now = self.plan.sequence.intrinsics
         for name in CAMERA:
-            was, here = about.get(name, np.nan), getattr(now, name)
+            was, here = about[name], getattr(now, name)
             if not abs(was - here) < SAME:
                 raise InputError(
                     f"{self.plan.address}: not the sequence that this run was begun with ({name} was {was:g} and is "
                     f"{here:g}); give that one with --sequence"
                 )
-        if about.get("sequence") != self.plan.address:
-            self.folder.write("run.json", about | {"sequence": self.plan.address})
 
     def _require_same_times(self) -> None:
         """Raises InputError when the frames that are done are not those of the sequence."""
@@ -336,12 +336,16 @@ class Run:
         self.folder.write("trajectory.txt", format_tum(self.timestamps(), self.poses()))
 
     def end(self, complete: bool, interrupt: Callable[[], None]) -> None:
-        """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock."""
+        """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock.
+
+        A last mapping that ``interrupt`` abandons leaves the map half-way: no checkpoint holds it, and ``resume`` makes
+        it from the one before.
+        """
         if complete and self.slam is not None and self.tally.rows and not self.torn and not self._settled:
             try:
                 self.slam.finish(interrupt)
             except Abandoned:
-                complete = False
+                complete, self.torn = False, True
         self.clock.pause()
         self.tally.wall_s = self.clock.seconds
         self.measure()

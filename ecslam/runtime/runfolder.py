@@ -40,6 +40,7 @@ from .files import LineLog, keep_lines, read_lines, require_space, to_json
 from .folderlock import claim
 
 NEEDED_MB = 500.0
+CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 LOGS = ("metrics.jsonl", "events.jsonl", "keyframes.jsonl")
 FILES = ("run.json", "config.yaml", "trajectory.txt", "groundtruth.txt", "mesh.ply", "summary.json", "picture.png")
 FOLDERS = ("thumbnails", "meshes", "checkpoints")
@@ -52,9 +53,7 @@ class RunFolder:
         self.path, self._lock = path, lock
         self.not_saved: dict[str, str] = {}
         self._problem = problem
-        for name in ("thumbnails", "meshes"):
-            (path / name).mkdir(exist_ok=True)
-        self._logs = {name: LineLog(path / name) for name in LOGS}
+        self._logs: dict[str, LineLog] = {}
 
     @classmethod
     def create(cls, path: Path, problem: Callable[[str], None], needed_mb: float = NEEDED_MB) -> RunFolder:
@@ -71,21 +70,25 @@ class RunFolder:
             (path / name).unlink(missing_ok=True)
         for name in FOLDERS:
             shutil.rmtree(path / name, ignore_errors=True)
-        return cls(path, problem, lock)
+        folder = cls(path, problem, lock)
+        folder.go_on(0)
+        return folder
 
     @classmethod
-    def reopen(cls, path: Path, position: int, problem: Callable[[str], None]) -> RunFolder:
-        """Go on in ``path`` from frame ``position``: what was logged for it and later frames is dropped.
-
-        Raises InputError as ``create`` does.
-        """
+    def reopen(cls, path: Path, problem: Callable[[str], None]) -> RunFolder:
+        """The folder of a run to resume, which stays as it is until ``go_on``. Raises InputError as ``create`` does."""
         require_space(path, NEEDED_MB)
-        lock = claim(path)
-        remove_temporaries(path)
-        (path / "summary.json").unlink(missing_ok=True)
+        return cls(path, problem, claim(path))
+
+    def go_on(self, position: int) -> None:
+        """Begin to log from frame ``position`` on: what was logged for it and later frames is dropped."""
+        remove_temporaries(self.path)
+        (self.path / "summary.json").unlink(missing_ok=True)
+        for name in ("thumbnails", "meshes"):
+            (self.path / name).mkdir(exist_ok=True)
         for name in LOGS:
-            keep_lines(path / name, lambda line: (line.get("frame") or 0) < position)
-        return cls(path, problem, lock)
+            keep_lines(self.path / name, lambda line: (line.get("frame") or 0) < position)
+            self._logs[name] = LineLog(self.path / name)
 
     def write(self, name: str, data: str | bytes | dict[str, Any]) -> Path | None:
         """Replace a file (a dict becomes JSON); None when it could not be saved."""
@@ -148,14 +151,6 @@ class RunFolder:
             self.missing(name, error)
         self._append("keyframes.jsonl", {"frame": frame, "c2w": c2w[:3].reshape(-1), "thumbnail": name})
 
-    def about(self) -> dict[str, Any]:
-        """``run.json``. Raises InputError when it is missing or damaged."""
-        try:
-            about = json.loads((self.path / "run.json").read_text("utf-8"))
-            return dict(about)
-        except (OSError, ValueError, TypeError):
-            raise InputError(f"{self.path / 'run.json'}: missing or damaged; start again with ecslam run") from None
-
     def loops(self) -> list[LoopEvent]:
         """The loop closures in the log."""
         lines = [line for line in read_lines(self.path / "events.jsonl") if line.pop("type", "") == "loop"]
@@ -185,13 +180,24 @@ class RunFolder:
             self._lock.close()
 
 
+def read_about(folder: Path) -> dict[str, Any]:
+    """``run.json`` of a run folder. Raises InputError when it is missing or damaged."""
+    path = folder / "run.json"
+    try:
+        about = dict(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, TypeError):
+        about = {}
+    if not about.keys() >= {"sequence", "frames", "frames_total", *CAMERA}:
+        raise InputError(f"{path}: missing or damaged; start again with ecslam run")
+    return about
+
+
 def _holds_a_run(path: Path) -> bool:
     """Whether a folder holds a run, or nothing but what a run begins with: a recording may have a ``mesh.ply`` and a
     ``groundtruth.txt`` too."""
     try:
-        about = json.loads((path / "run.json").read_text("utf-8"))
-        return "sequence" in about and "frames_total" in about
-    except (OSError, ValueError, TypeError):
+        return bool(read_about(path))
+    except InputError:
         ours = {*LOGS, "run.json", "config.yaml", *FOLDERS}
         found = [p for p in path.iterdir() if not p.name.startswith(".")]
         return all(p.name in ours and not (p.is_dir() and any(p.iterdir())) for p in found)

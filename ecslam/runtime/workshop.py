@@ -29,6 +29,7 @@ class Workshop:
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
         self._jobs = JobThread(lambda error: self._complain(f"a mesh or an export failed: {error}"))
+        self._showing = threading.Lock()
         self._live = LiveMeshes()
         self._leaving: Callable[[], bool] = lambda: False
 
@@ -38,8 +39,9 @@ class Workshop:
         return self._jobs.waiting
 
     def begin(self, leaving: Callable[[], bool]) -> None:
-        """A run begins; jobs end early when ``leaving`` answers True."""
-        self._live = LiveMeshes()
+        """A run begins; jobs end early when ``leaving`` answers True, and the run before shows no more meshes."""
+        with self._showing:
+            self._live = LiveMeshes()
         self._leaving = leaving
 
     def close(self) -> None:
@@ -47,7 +49,7 @@ class Workshop:
         self._jobs.close()
 
     def take_up(self, run: Run, orders: list[tuple[int, Command]]) -> None:
-        """Begin what was ordered; orders taken up together share one frozen map."""
+        """Begin what was ordered; orders taken up together share one frozen map. One that fails is told."""
         frozen: FrozenMap | None = None
         for command_id, command in orders:
             try:
@@ -61,11 +63,22 @@ class Workshop:
                     self._jobs.submit(self._mesh_job(_needed(frozen), command))
                 elif isinstance(command, Export):
                     self._jobs.submit(export_job(run, command, command_id, frozen, self._feed.publish, self._leaving))
-            except (InputError, OSError) as error:
-                self._complain(str(error))
+            except Exception as error:
+                self._complain(str(error) or type(error).__name__)
 
     def _mesh_job(self, frozen: FrozenMap, order: RequestMesh) -> Callable[[], None]:
-        return lambda: self._feed.publish(build_mesh(frozen, order.voxel_m, order.max_triangles, self._leaving))
+        live, over = self._live, self._over()
+        return lambda: self._show(live, build_mesh(frozen, order.voxel_m, order.max_triangles, over))
+
+    def _over(self) -> Callable[[], bool]:
+        """Whether nobody waits for the meshes of this run any more."""
+        live, leaving = self._live, self._leaving
+        return lambda: leaving() or live is not self._live
+
+    def _show(self, live: LiveMeshes, ready: MeshReady | None) -> None:
+        with self._showing:
+            if ready is not None and live is self._live:
+                self._feed.publish(ready)
 
     def first_look(self, run: Run, frame: Frame) -> None:
         """What the camera measured in the run's first frame, for the watchers, until the map has learnt it."""
@@ -79,13 +92,9 @@ class Workshop:
         wanted = self._feed.watched and bool(run.tally.rows) and (at_once or self._live.due)
         frozen = run.freeze(LIVE_POINTS) if wanted else None
         if frozen is not None:
-            self._live.begin()
-            self._jobs.submit(lambda: self._make_live(self._live, frozen))
-
-    def _make_live(self, live: LiveMeshes, frozen: FrozenMap) -> None:
-        ready = live.make(frozen, self._leaving)
-        if ready is not None:
-            self._feed.publish(ready)
+            live, over = self._live, self._over()
+            live.begin()
+            self._jobs.submit(lambda: self._show(live, live.make(frozen, over)))
 
     def keep(self, run: Run) -> None:
         """A few meshes over the run, for looking back later; the first after the first frame."""
