@@ -33,9 +33,10 @@ from ecslam.runtime.protocol import EngineHandle
 
 from . import theme
 from .broadcast import downloading
-from .history import History, with_last_mapping
+from .history import History, history_of, with_last_mapping
 from .panel import TABS, BasePanel, find_panels
 from .replay import ReplayEngine
+from .runs import frame_rows
 from .scene import Scene
 from .views import Views
 
@@ -245,7 +246,7 @@ class Hub:
 
     def _begin(self, s: Snapshot) -> None:
         if self.replay is None:
-            self.history = History()
+            self.history = history_of(frame_rows(self.engine.run_folder))
         self.scene.begin(s)
         for client in self.viewers():
             self.views.show_all(client, 0.0)

@@ -36,7 +36,7 @@ from ecslam.runtime.feed import Feed, FeedSubscription
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.types import InputError
 
-from .history import FIGURES, History
+from .history import history_of
 from .past import Past
 from .runs import Run, drawable_mesh, kitti_lines, load_mesh, tum_lines
 
@@ -52,7 +52,7 @@ class ReplayEngine:
         self.run, self.others = run, others
         self.run_folder = run.folder
         self.sequences = (str(run.summary.get("sequence", run.name)),)
-        self.history = run_history(run)
+        self.history = history_of(run.rows)
         self._past = Past(run.rows, run.trajectory)
         self._frame, self._playing, self._period = len(run.rows) - 1, False, 1 / FRAMES_PER_S
         self._inbox: queue.SimpleQueue[tuple[int, Command] | None] = queue.SimpleQueue()
@@ -180,15 +180,6 @@ class ReplayEngine:
             skipped=int(run.summary.get("skipped_frames") or 0),
             lost_frames=int(run.summary.get("lost_frames") or 0),
         )
-
-
-def run_history(run: Run) -> History:
-    """The figures of all frames of a run."""
-    history = History()
-    for row in run.rows:
-        figures = {name: float(row[name]) for name in FIGURES if row.get(name) is not None}
-        history.add(int(row["frame"]), figures, row.get("losses") or {}, tuple(row.get("window") or ()))
-    return history
 
 
 def export(run: Run, command: Export) -> Path:

@@ -55,7 +55,7 @@ def load_run(folder: Path) -> Run:
     """Read a run folder. Raises InputError when it is not one."""
     if not (folder / "metrics.jsonl").is_file():
         raise InputError(f"{folder}: not a run folder (no metrics.jsonl); give the --out folder of `ecslam run`")
-    rows = tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
+    rows = frame_rows(folder)
     if not rows:
         raise InputError(f"{folder / 'metrics.jsonl'}: holds no frame; the run ended before its first one")
     summary = _json(folder / "summary.json")
@@ -80,6 +80,11 @@ def load_run(folder: Path) -> Run:
         fov_y_rad=float(2 * np.arctan(camera["height"] / 2 / camera["fy"])),
         aspect=float(camera["width"] / camera["height"]),
     )
+
+
+def frame_rows(folder: Path) -> tuple[dict[str, Any], ...]:
+    """A line for each frame that a run folder has on record so far; none where there is no ``metrics.jsonl``."""
+    return tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
 
 
 def load_mesh(path: Path) -> Mesh:

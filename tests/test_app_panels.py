@@ -74,6 +74,17 @@ def test_the_last_window_stays_on_the_page_between_two_mappings(engine, page):
     assert page.hub.current.window == (), "a new run has had no mapping yet"
 
 
+def test_the_plots_of_a_resumed_run_begin_at_its_first_frame(tmp_path):
+    folder = write_run(tmp_path / "run", 30)
+    engine = FakeEngine(folder, frames=60).skip_to(30)
+    page = server.start(engine, port=0)
+    try:
+        assert until(lambda: page.hub.current is engine.latest())
+        assert page.hub.history.series(["ate_cm"])[0].tolist() == list(range(31))
+    finally:
+        page.close()
+
+
 def test_a_halt_is_announced_until_it_has_come_about(engine, page):
     engine.skip_to(9)
     assert until(lambda: page.hub.current is engine.latest())
