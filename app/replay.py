@@ -20,7 +20,6 @@ from ecslam.messages import (
     Export,
     Exported,
     MeshReady,
-    Notice,
     Pause,
     Quit,
     RequestMesh,
@@ -58,6 +57,7 @@ class ReplayEngine:
         self._inbox: queue.SimpleQueue[tuple[int, Command] | None] = queue.SimpleQueue()
         self._ids, self._lock = 0, threading.Lock()
         self._shown_mesh: Path | None = None
+        self._problem = ""
         self._feed = Feed()
         self._feed.publish(self._snapshot())
         self._thread = threading.Thread(target=self._work, name="replay", daemon=True)
@@ -136,10 +136,13 @@ class ReplayEngine:
         if path is None or path == self._shown_mesh or not self._feed.watched:
             return
         self._shown_mesh = path
+        before, self._problem = self._problem, ""
         try:
             self._feed.publish(MeshReady(frame, 0.0, drawable_mesh(path)))
         except InputError as error:
-            self._feed.publish(Notice("warning", str(error), frame))
+            self._problem = str(error)
+        if self._problem != before:
+            self._feed.publish(self._snapshot())
 
     def _go_to(self, frame: int) -> None:
         last = len(self.run.rows) - 1
@@ -179,6 +182,7 @@ class ReplayEngine:
             loops=tuple(e for e in run.loops if e.frame <= frame),
             skipped=int(run.summary.get("skipped_frames") or 0),
             lost_frames=int(run.summary.get("lost_frames") or 0),
+            reason=self._problem,
         )
 
 

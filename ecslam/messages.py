@@ -115,8 +115,8 @@ class Snapshot:
 
     trajectory: float64 [n, 4, 4] estimate of frames 0..n-1, in the world of the ground truth where there is one.
     trajectory_gt: float64 [N, 4, 4] (NaN where missing) or None. color: uint8 [h, w, 3] of the current frame, small.
-    fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, else "". map_loss: the
-    objective of the last mapping so far; losses: see ``StepReport``.
+    fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, or what cannot be
+    shown, else "". map_loss: the objective of the last mapping so far; losses: see ``StepReport``.
     """
 
     state: State

@@ -85,6 +85,35 @@ def test_the_plots_of_a_resumed_run_begin_at_its_first_frame(tmp_path):
         page.close()
 
 
+def test_why_there_is_no_mesh_stays_on_the_page(tmp_path):
+    run = write_run(tmp_path / "a", 30)
+    (run / "mesh.ply").write_bytes(b"ply\nnonsense")
+    page = server.view([run], port=0)
+    status = next(p for p in page.hub.panels if isinstance(p, Status))
+    try:
+        assert until(lambda: "mesh.ply: not a readable mesh" in status._html.content)
+        page.engine.submit(m.RunTo(5))
+        assert until(lambda: page.hub.current.frame == 5)
+        assert "mesh.ply: not a readable mesh" in status._html.content
+    finally:
+        page.close()
+
+
+def test_a_second_run_without_a_readable_mesh_says_so(tmp_path, monkeypatch):
+    runs = [write_run(tmp_path / name, 30) for name in "ab"]
+    (runs[1] / "mesh.ply").write_bytes(b"ply\nnonsense")
+    page, told = server.view(runs, port=0), []
+    monkeypatch.setattr(page.hub, "toast", lambda title, text, *rest: told.append(text))
+    try:
+        with dial(page) as client:
+            enter(client)
+            press(page, client, "Mesh of", "b")
+            assert until(lambda: told)
+        assert "mesh.ply: not a readable mesh" in told[0]
+    finally:
+        page.close()
+
+
 def test_a_halt_is_announced_until_it_has_come_about(engine, page):
     engine.skip_to(9)
     assert until(lambda: page.hub.current is engine.latest())

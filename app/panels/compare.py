@@ -5,6 +5,7 @@ from __future__ import annotations
 from html import escape
 
 from ecslam.messages import Event, MeshReady, RequestMesh, Snapshot
+from ecslam.types import InputError
 
 from .. import theme
 from ..hub import Hub
@@ -55,8 +56,12 @@ class Panel(BasePanel):
     def event(self, event: Event) -> None:
         """A mesh of the first run has come; show the second one's of that frame instead where it is wanted."""
         path = self._other.mesh_at(event.frame) if isinstance(event, MeshReady) else None
-        if path is not None and self._mesh_of.value == self._shown[1]:
+        if path is None or self._mesh_of.value != self._shown[1]:
+            return
+        try:
             self.hub.scene.show_mesh(drawable_mesh(path))
+        except InputError as error:
+            self.hub.toast("No mesh", str(error), "red")
 
 
 def figures_table(a: Run, b: Run) -> str:
