@@ -18,7 +18,7 @@ from ecslam_app.panels.status import Panel as Status
 from ecslam import config as configuration
 from ecslam import messages as m
 from tests.fake_engine import FakeEngine, write_run
-from tests.test_app_security import control, dial, enter, press, until
+from tests.test_app_security import control, dial, enter, hit, press, until
 
 PANELS = find_panels()
 
@@ -180,6 +180,32 @@ def test_the_slider_of_a_replay_follows_wherever_it_goes(replay_page):
         assert slider.value == 20
     replay_page.engine.submit(m.Step())
     assert until(lambda: slider.value == 21)
+
+
+def test_the_space_key_plays_and_pauses_a_replay(replay_page):
+    replay_page.engine.submit(m.SpeedLimit(1.0))
+    replay_page.engine.submit(m.RunTo(3))
+    with dial(replay_page) as client:
+        enter(client)
+        assert until(lambda: replay_page.hub.current.frame == 3)
+        hit(replay_page, client, "Pause or go on")
+        assert until(lambda: replay_page.hub.current.state is m.State.TRACKING)
+        hit(replay_page, client, "Pause or go on")
+        assert until(lambda: replay_page.hub.current.state is m.State.PAUSED)
+        before = replay_page.hub.current.frame
+        hit(replay_page, client, "Step one frame")
+        assert until(lambda: replay_page.hub.current.frame == before + 1)
+
+
+def test_the_space_key_pauses_a_run_and_lets_it_go_on(page, engine):
+    engine.start()
+    with dial(page) as client:
+        enter(client)
+        assert until(lambda: page.hub.current is not None)
+        hit(page, client, "Pause or go on")
+        assert until(lambda: page.hub.current.state is m.State.PAUSED)
+        hit(page, client, "Pause or go on")
+        assert until(lambda: m.Resume() in engine.log)
 
 
 def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, page):

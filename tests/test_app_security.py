@@ -95,6 +95,12 @@ def press(page, client, label, value):
     say(client, "GuiUpdateMessage", uuid=control(page, label)[0], updates={"value": value})
 
 
+def hit(page, client, label):
+    """The hot key of this command, or its line in the palette."""
+    commands = page.hub.server.gui._command_handle_from_uuid
+    say(client, "CommandTriggerMessage", uuid=next(u for u, c in commands.items() if c.label == label))
+
+
 def alive(page, client, engine):
     """The connection still works: an honest click arrives."""
     before = engine.log.count(m.Pause())

@@ -1,4 +1,4 @@
-"""Steering a live run: pause, resume, step, run to, stop, start over, live parameters; hot keys space and n."""
+"""Steering a live run: pause, resume, step, run to, stop, start over, live parameters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from ecslam.messages import (
     RunTo,
     Snapshot,
     SpeedLimit,
-    State,
     Step,
     Stop,
     Tune,
@@ -50,7 +49,6 @@ class Panel(BasePanel):
         hub.commands(gui.add_button("Run to frame", color="gray"), lambda: RunTo(int(self._until.value) - 1))
         self._limit = gui.add_slider("Speed limit", 0, 60, 1, 0, hint="Frames per second at most; 0 lifts the limit")
         hub.on(self._limit, lambda event: hub.submit(SpeedLimit(float(self._limit.value)), event.client))
-        self._hot_keys()
         self._start_over()
         self._live_parameters()
 
@@ -60,20 +58,6 @@ class Panel(BasePanel):
             put(self._until, max(1, s.frames_total // 2))
         if s.preset != self._shown_preset:
             self._show_preset(s.preset)
-
-    def _hot_keys(self) -> None:
-        gui = self.hub.server.gui
-        toggle = gui.add_command("Pause or resume", hotkey="space", description="Stop after this frame, or go on")
-        step = gui.add_command("Step one frame", hotkey="N", description="Process one frame, then pause")
-
-        @toggle.on_trigger
-        async def _(event: Any) -> None:
-            paused = self.hub.current is not None and self.hub.current.state == State.PAUSED
-            self.hub.submit(Resume() if paused else Pause(), event.client)
-
-        @step.on_trigger
-        async def _(event: Any) -> None:
-            self.hub.submit(Step(), event.client)
 
     def _start_over(self) -> None:
         gui, engine = self.hub.server.gui, self.hub.engine

@@ -25,7 +25,7 @@ class Panel(BasePanel):
         self._slider = gui.add_slider("Frame", 1, max(last, 2), 1, last)
         self._asked: int | None = None
         hub.on(self._slider, lambda event: self._go_to(int(self._slider.value)))
-        verbs = gui.add_button_group("Replay", tuple(_VERBS))
+        verbs = gui.add_button_group("Replay", tuple(_VERBS), hint="Space plays and pauses, n goes one step")
         hub.commands(verbs, lambda: _VERBS[verbs.value])
         speed = gui.add_slider("Frames per second", 1, 60, 1, 20)
         hub.on(speed, lambda event: hub.submit(SpeedLimit(float(speed.value)), event.client))
