@@ -182,7 +182,7 @@ def run_with_dashboard(engine: Engine, host: str, port: int, browser: bool) -> N
     reports = Reports(engine)
     with quit_on_signals(engine):
         dashboard = server.start(engine, host, port)
-        _announce(dashboard, browser)
+        _announce(dashboard, browser, "everything but an unfinished run's mesh is saved first")
         engine.start(reports.watch)
         engine.join()
     dashboard.close()
@@ -196,7 +196,7 @@ def view(folders: list[Path], host: str, port: int, browser: bool) -> None:
     from ecslam_app import server
 
     dashboard = server.view(folders, host, port)
-    _announce(dashboard, browser)
+    _announce(dashboard, browser, "the runs stay as they are")
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
@@ -224,7 +224,8 @@ def bench_viewers(address: str, preset: str, frames: str, viewers: int, pairs: i
 
 
 class Reports:
-    """Reports every run of an engine once, as soon as it is over, on a thread of its own: drawing takes seconds."""
+    """Reports every run of an engine once, as soon as it is over, on a thread of its own: drawing takes seconds. What
+    ended a run that failed is said at once."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -235,6 +236,8 @@ class Reports:
         """Take every snapshot, on the engine's thread."""
         if s.state is State.FINISHED:
             self._report()
+        elif s.state is State.FAILED:
+            console.print(f"error: {s.reason}", soft_wrap=True, markup=False)
 
     def _report(self) -> None:
         folder, summary = self._engine.run_folder, self._engine.summary
@@ -250,7 +253,7 @@ class Reports:
 
 
 def finish_run(folder: Path, summary: dict[str, Any]) -> None:
-    """Draw the picture of the run, print its figures and where they lie."""
+    """Draw the picture of the run, print its figures and where they lie, and how to get a mesh that it lacks."""
     picture = draw_picture(folder)
     for name in FIGURES:
         value = summary[name]
@@ -262,6 +265,9 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     for note in (summary["kernels_note"], *(f"{name} not saved ({why})" for name, why in summary["not_saved"].items())):
         if note:
             console.print(f"  note: {note}", soft_wrap=True, markup=False)
+    if not (folder / "mesh.ply").is_file():
+        text = f"  no mesh.ply yet: ecslam mesh {folder} makes it, or ecslam resume {folder} goes on with the run"
+        console.print(text, soft_wrap=True, markup=False)
 
 
 def draw_picture(folder: Path) -> Path | None:
@@ -340,9 +346,9 @@ def _progress() -> Progress:
     return Progress(*columns, console=console, refresh_per_second=4)
 
 
-def _announce(dashboard: Any, browser: bool) -> None:
+def _announce(dashboard: Any, browser: bool, at_the_end: str) -> None:
     console.print(f"Dashboard: {dashboard.url}", soft_wrap=True)
     console.print(f"From another machine: {dashboard.ssh_hint}, then open the same address there", soft_wrap=True)
-    console.print("Ctrl-C ends it; everything is saved first.")
+    console.print(f"Ctrl-C ends it; {at_the_end}.")
     if browser:
         webbrowser.open(dashboard.url)
