@@ -208,6 +208,21 @@ def test_the_space_key_pauses_a_run_and_lets_it_go_on(page, engine):
         assert until(lambda: m.Resume() in engine.log)
 
 
+@pytest.mark.parametrize("end", [m.State.FINISHED, m.State.FAILED])
+def test_a_run_that_is_over_offers_no_steering_until_a_restart(engine, page, end):
+    def usable():
+        labels = ("Frame", "Run to frame", "Go on with this preset", "Mapping iterations", "Tracking iterations")
+        return {control(page, "Run")[1].visible, *(not control(page, label)[1].disabled for label in labels)}
+
+    s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)
+    assert until(lambda: page.hub.current is engine.latest())
+    for shown, wanted in ((s, True), (replace(s, frame=10, state=end), False), (replace(s, frame=0), True)):
+        page.hub._take(shown)
+        assert until(lambda shown=shown: page.hub.current.state is shown.state)
+        assert until(lambda wanted=wanted: usable() == {wanted})
+    assert not control(page, "Restart")[1].disabled
+
+
 def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, page):
     panel = next(p for p in page.hub.panels if p.tab == "Pictures")
     s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)
