@@ -84,9 +84,9 @@ STYLE = """
 .ec-key i{display:inline-block;width:14px;height:3px;border-radius:2px;margin-right:5px;background:var(--c);
   vertical-align:middle}
 .ec-six{display:grid;grid-template-columns:1fr 1fr;gap:5px}
-.ec-six figure{margin:0;position:relative;border-radius:6px;overflow:hidden;background:#8884;aspect-ratio:4/3}
+.ec-six figure{margin:0;position:relative;border-radius:6px;overflow:hidden;background:#8884}
 .ec-six figure:only-child{grid-column:1/-1}
-.ec-six img{width:100%;height:100%;object-fit:cover;display:block}
+.ec-six img{width:100%;display:block}
 .ec-six figcaption{position:absolute;left:5px;bottom:4px;font-size:10px;padding:0 6px;border-radius:9px;color:#fff;
   background:#0009}
 """

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import viser
 from ecslam_app import server
 from ecslam_app.panel import TABS, BasePanel, find_panels
 from ecslam_app.panels.status import WORDS, render
@@ -333,6 +334,16 @@ def test_each_control_sends_its_command(page, engine, label, value, command):
         enter(client)
         press(page, client, label, value)
         assert until(lambda: command in engine.log)
+
+
+def test_the_mesh_mode_in_force_is_marked(replay_page):
+    with dial(replay_page) as client:
+        enter(client)
+        press(replay_page, client, "Mesh", "Wireframe")
+        assert until(lambda: replay_page.hub.scene._mode == "Wireframe")
+    mode = control(replay_page, "Mesh")[1]
+    assert isinstance(mode, viser.GuiDropdownHandle), "unlike a group of buttons, it shows its value"
+    assert mode.value == "Wireframe"
 
 
 def test_live_only_controls_are_absent_from_a_replay(replay_page):

@@ -10,10 +10,11 @@ import zipfile
 import numpy as np
 import pytest
 import trimesh
-from ecslam_app import server
+from ecslam_app import server, theme
 from ecslam_app.geometry import best_side, overview, rotation_difference_deg, rotation_to, up_direction
 from ecslam_app.glb import simplify, to_glb, vertex_normals
 from ecslam_app.history import History
+from ecslam_app.panels.compare import figures_table
 from ecslam_app.past import Past
 from ecslam_app.record import html_replay
 from ecslam_app.replay import ReplayEngine
@@ -147,6 +148,13 @@ def test_exports(replay, folder):
     with zipfile.ZipFile(events(replay, m.Exported, m.Export("run", "zip"))[0].path) as archive:
         assert {"metrics.jsonl", "mesh.ply", "summary.json"} <= set(archive.namelist())
         assert not any(name.startswith("exports") for name in archive.namelist())
+
+
+def test_a_comparison_says_which_path_is_whose(folder):
+    run = load_run(folder)
+    html = figures_table(run, run, ("First", "Second"))
+    for name, color in (("First", theme.ESTIMATE), ("Second", theme.OTHER)):
+        assert f'<i style="--c:{theme.css(color)}"></i>path of {name}' in html
 
 
 def test_killed_run_with_a_cut_line_opens(folder, tmp_path):

@@ -59,6 +59,10 @@ class Visit:
     def press(self, name):
         self.page.get_by_role("button", name=name, exact=True).click()
 
+    def choose(self, label, option):
+        self.page.get_by_label(label, exact=True).first.click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
     def tab(self, name):
         self.page.get_by_role("tab", name=name).click()
 
@@ -120,7 +124,7 @@ def test_scene_shows_mesh_trajectories_and_frusta(live):
     _, visit = live
     visit.tab("View")
     full = visit.pixels()
-    visit.press("Off")
+    visit.choose("Mesh", "Off")
     visit.wait(lambda: (np.abs(full - visit.pixels()).max(-1) > 25).mean() > 0.1)  # the mesh covers much of the view
     bare = visit.pixels()
     assert hue_count(bare, 25) > 300, "the estimate is orange"
@@ -130,7 +134,7 @@ def test_scene_shows_mesh_trajectories_and_frusta(live):
     visit.wait(lambda: hue_count(visit.pixels(), 217) < 0.2 * hue_count(bare, 217))
     visit.tick("Keyframes")
     visit.wait(lambda: hue_count(visit.pixels(), 292) < 0.5 * hue_count(bare, 292))
-    visit.press("Wireframe")
+    visit.choose("Mesh", "Wireframe")
     visit.wait(lambda: (np.abs(visit.pixels() - bare).max(-1) > 25).mean() > 0.02)
 
 
@@ -159,8 +163,7 @@ def test_pause_step_resume_and_hot_keys(live):
 
 def test_switch_preset_and_start_over(live):
     engine, visit = live
-    visit.page.get_by_label("Preset", exact=True).first.click()
-    visit.page.get_by_role("option", name="full", exact=True).click()
+    visit.choose("Preset", "full")
     visit.press("Restart")
     visit.wait(lambda: m.Restart("synthetic/studio", "full", 0, "strict") in engine.log)
     visit.page.locator(".ec-name", has_text="full").wait_for()
@@ -295,10 +298,10 @@ def test_the_engine_proper_is_watched_paused_stepped_and_taken_away(browser, tmp
         visit.wait(lambda: visit.frame == before + 1)
         visit.state("Paused")
         visit.tab("View")
-        visit.press("Off")
+        visit.choose("Mesh", "Off")
         visit.wait(lambda: not dashboard.hub.scene._mesh_handle.visible)
         bare = visit.pixels()
-        visit.press("Colour")
+        visit.choose("Mesh", "Colour")
         visit.wait(lambda: (np.abs(visit.pixels() - bare).max(-1) > 25).mean() > 0.03)
         visit.tab("Export")
         visit.download("Export mesh").save_as(tmp_path / "mesh.ply")
