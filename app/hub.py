@@ -264,7 +264,7 @@ class Hub:
         elif isinstance(message, Notice):
             self._notice(message)
         elif isinstance(message, LoopEvent):
-            self.toast("Loop closed", f"Frame {message.frame + 1}: corrected by {message.correction_cm:.2f} cm", "teal")
+            self.toast("Loop closed", f"Frame {message.frame}: corrected by {message.correction_cm:.2f} cm", "teal")
         for panel in self.panels:
             panel.event(message)
 

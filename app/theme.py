@@ -53,8 +53,8 @@ STYLE = """
   --button-color:var(--mantine-color-text)!important;border:1px solid var(--mantine-color-default-border)}
 @media (max-width:48em){.mantine-Paper-root[style*="bottom: 0px"]{width:100%!important;max-height:52%!important;
   border-radius:14px 14px 0 0!important}.mantine-Paper-root [style*="width: 20em"]{width:100%!important}}
-.u-legend .u-series:first-child,.u-legend .u-value{display:none!important}
-.u-legend th:after{content:none!important}
+.u-legend{font-size:11.5px!important;text-align:left!important}
+.ec-upright{display:none!important}
 .u-title{font-size:12.5px!important;font-weight:600}
 .ec{font-size:12.5px;line-height:1.45;color:var(--mantine-color-text);padding:4px 8px 6px;
   font-variant-numeric:tabular-nums}

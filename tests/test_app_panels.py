@@ -170,17 +170,29 @@ def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
 def test_the_slider_of_a_replay_follows_wherever_it_goes(replay_page):
     slider = control(replay_page, "Frame")[1]
     replay_page.engine.submit(m.RunTo(11))
-    assert until(lambda: slider.value == 12)
+    assert until(lambda: slider.value == 11)
     replay_page.engine.submit(m.Step())
-    assert until(lambda: slider.value == 13)
+    assert until(lambda: slider.value == 12)
     with dial(replay_page) as client:
         enter(client)
         assert until(lambda: list(replay_page.hub.viewers()))
         press(replay_page, client, "Frame", 20)
-        assert until(lambda: replay_page.hub.current.frame == 19)
+        assert until(lambda: replay_page.hub.current.frame == 20)
         assert slider.value == 20
     replay_page.engine.submit(m.Step())
     assert until(lambda: slider.value == 21)
+
+
+def test_the_plots_of_a_replay_mark_the_frame_that_is_shown(replay_page):
+    chart = next(p for p in replay_page.hub.panels if p.tab == "Plots")._error
+    for frame in (4, 23):
+        replay_page.engine.submit(m.RunTo(frame))
+        assert until(lambda frame=frame: replay_page.hub.current.frame == frame)
+        assert until(lambda frame=frame: set(chart._plot.data[0][np.isfinite(chart._plot.data[-1])]) == {frame})
+    frames, values, upright = chart._plot.data
+    assert frames[np.isfinite(values)].tolist() == sorted([*range(30), 23])
+    assert upright[np.isfinite(upright)].tolist() == [0.0, chart._plot.scales["y"]["range"][1]]
+    assert len(chart._plot.series) == 3
 
 
 def test_the_space_key_plays_and_pauses_a_replay(replay_page):
@@ -244,7 +256,7 @@ def test_a_replay_shows_the_pictures_that_its_run_kept(replay_page, engine):
     panel = next(p for p in replay_page.hub.panels if p.tab == "Pictures")
     assert "kept no pictures" in panel._html.content
     panel.snapshot(engine.skip_to(12).snapshot())
-    assert "Keyframe 11" in panel._html.content
+    assert "Keyframe 10" in panel._html.content
     assert "data:image/jpeg" in panel._html.content
 
 
@@ -299,7 +311,8 @@ def test_state_is_told_in_plain_words(engine, state):
     html = render(replace(engine.snapshot(), state=state, reason="why <b>"), "")
     assert WORDS[state] in html
     assert "why &lt;b&gt;" in html
-    assert "Frame <b>1</b> of 60" in html
+    assert "Frame <b>0</b></span>" in html
+    assert "1 of 60" in html
 
 
 def test_controls_answer_at_once_while_the_page_is_busy(page, engine):

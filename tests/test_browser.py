@@ -179,7 +179,7 @@ def test_exports_arrive_in_the_browser(live, tmp_path):
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
     visit.page.get_by_text(str(engine.run_folder)).first.wait_for()
     visit.download("Export trajectory").save_as(tmp_path / "poses.txt")
-    assert len((tmp_path / "poses.txt").read_text().splitlines()) == visit.frame
+    assert len((tmp_path / "poses.txt").read_text().splitlines()) == visit.frame + 1
     visit.download("Save screenshot").save_as(tmp_path / "shot.png")
     assert np.asarray(Image.open(tmp_path / "shot.png")).std() > 10
     assert list((engine.run_folder / "exports").glob("screenshot_*.png"))
@@ -233,15 +233,15 @@ def test_finished_run_is_scrubbed_and_its_loop_inspected(browser, tmp_path):
     dashboard = server.view([write_run(tmp_path / "lite", 60), write_run(tmp_path / "full", 60, drift=0.3)], port=0)
     visit = Visit(browser, dashboard)
     try:
-        assert visit.frame == 60
+        assert visit.frame == 59
         assert visit.page.get_by_text("ATE RMSE, cm").count() == 1
         slider = visit.page.get_by_role("slider").first
         slider.focus()
         for _ in range(12):
             visit.page.keyboard.press("ArrowLeft")
-        visit.wait(lambda: visit.frame == 48)
+        visit.wait(lambda: visit.frame == 47)
         visit.press("Play")
-        visit.wait(lambda: visit.frame == 60)
+        visit.wait(lambda: visit.frame == 59)
         before = visit.camera
         visit.tab("Loops")
         visit.press("Next event")
@@ -249,6 +249,10 @@ def test_finished_run_is_scrubbed_and_its_loop_inspected(browser, tmp_path):
         visit.page.wait_for_timeout(1500)
         assert np.linalg.norm(visit.camera - before) > 0.3
         assert hue_count(visit.pixels(), 160) > 20, "the links are green"
+        visit.tab("Plots")
+        visit.page.locator(".u-over:visible").first.hover()
+        shown = visit.page.locator(".u-legend:visible .u-value:visible")
+        visit.wait(lambda: [float(text) > 0 for text in shown.all_inner_texts()[:2] if text != "--"] == [True, True])
     finally:
         visit.page.close()
         dashboard.close()
@@ -309,7 +313,7 @@ def test_the_engine_proper_is_watched_paused_stepped_and_taken_away(browser, tmp
         assert len(mesh.faces) > 1000
         assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 100
         visit.download("Export trajectory").save_as(tmp_path / "poses.txt")
-        assert len((tmp_path / "poses.txt").read_text().splitlines()) == before + 1 == visit.frame
+        assert len((tmp_path / "poses.txt").read_text().splitlines()) == before + 2 == visit.frame + 1
     finally:
         visit.page.close()
         engine.submit(m.Quit())

@@ -53,7 +53,7 @@ def test_step_and_run_to_process_exactly_the_frames_asked_for(tmp_path):
             snapshot = watch.go(Step(), State.PAUSED)
             assert (snapshot.frame, len(snapshot.trajectory)) == (done - 1, done)
         assert len(watch.go(RunTo(9), State.PAUSED).trajectory) == 10
-        assert watch.ask(RunTo(3)).error == "cannot run to frame 4; 11 .. 30 lie ahead"
+        assert watch.ask(RunTo(3)).error == "cannot run to frame 3; 10 .. 29 lie ahead"
         assert "lie ahead" in watch.ask(RunTo(30)).error
         assert len(watch.go(Resume(), State.FINISHED).trajectory) == 30
         for command in (Pause(), Resume(), Step(), RunTo(3), Stop()):
@@ -175,7 +175,7 @@ def test_tune_and_load_preset_reach_the_engine(tmp_path):
         exported = yaml.safe_load(Path(watch.event(Exported).path).read_text())
         assert exported["tracking"]["rays"] == 2000
     log = (tmp_path / "events.jsonl").read_text()
-    assert "mapping.iterations = 40 from frame 4 on" in log
+    assert "mapping.iterations = 40 from frame 3 on" in log
 
 
 def test_steps_asked_for_while_one_is_at_work_add_up():

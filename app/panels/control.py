@@ -46,19 +46,19 @@ class Panel(BasePanel):
         self._verbs = gui.add_button_group("Run", tuple(_VERBS), hint="Space pauses and resumes, n goes one step")
         hub.commands(self._verbs, lambda: _VERBS[self._verbs.value])
         self._until = gui.add_number(
-            "Frame", 1, min=1, max=1_000_000, step=1, hint="Go on until this frame, then pause"
+            "Frame", 0, min=0, max=1_000_000, step=1, hint="Go on until this frame is done, then pause"
         )
         self._run_to = gui.add_button("Run to frame", color="gray")
-        hub.commands(self._run_to, lambda: RunTo(int(self._until.value) - 1))
+        hub.commands(self._run_to, lambda: RunTo(int(self._until.value)))
         self._limit = gui.add_slider("Speed limit", 0, 60, 1, 0, hint="Frames per second at most; 0 lifts the limit")
         hub.on(self._limit, lambda event: hub.submit(SpeedLimit(float(self._limit.value)), event.client))
         self._start_over()
         self._live_parameters()
 
     def snapshot(self, s: Snapshot) -> None:
-        if int(self._until.max or 0) != s.frames_total:
-            self._until.max = s.frames_total
-            put(self._until, max(1, s.frames_total // 2))
+        if self._until.max != s.frames_total - 1:
+            self._until.max = s.frames_total - 1
+            put(self._until, s.frames_total // 2)
         if s.preset != self._shown_preset:
             self._show_preset(s.preset)
         self._offer(s.state not in OVER)

@@ -74,7 +74,7 @@ class Panel(BasePanel):
     def _path(self, name: str) -> Path:
         folder = self.hub.engine.run_folder / "exports"
         folder.mkdir(parents=True, exist_ok=True)
-        frame = 0 if self.hub.current is None else self.hub.current.frame + 1
+        frame = 0 if self.hub.current is None else self.hub.current.frame
         return folder / name.format(frame=frame)
 
     def _screenshot(self, client: Any) -> Path:

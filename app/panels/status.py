@@ -92,7 +92,7 @@ def render(s: Snapshot | None, coming: str) -> str:
     return (
         f'<div class="ec"><div class="ec-head">{theme.chip(coming or WORDS[s.state], color)}'
         f'<span class="ec-name dim">{escape(s.sequence)} · {escape(s.preset)}</span></div>'
-        f'<div class="ec-row"><span>Frame <b>{s.frame + 1}</b> of {s.frames_total}</span>'
-        f'<span class="dim">{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
+        f'<div class="ec-row"><span>Frame <b>{s.frame}</b></span><span class="dim">{s.frame + 1} of {s.frames_total}, '
+        f'{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
         f'<div class="ec-grid">{"".join(cells)}</div>{_LEGEND}{"".join(notes)}</div>'
     )

@@ -143,7 +143,7 @@ class Control:
             self._leave_at = min(self._leave_at, monotonic() + GRACE_S)
         elif isinstance(command, RunTo):
             if not self.position <= command.frame < self._total:
-                raise InputError(f"cannot run to frame {command.frame + 1}; {self._ahead()}")
+                raise InputError(f"cannot run to frame {command.frame}; {self._ahead()}")
             self._paused, self._pause_at = False, command.frame + 1
         else:
             self._paused = isinstance(command, Pause)
@@ -157,8 +157,8 @@ class Control:
             raise InputError("the run is over; restart it")
 
     def _ahead(self) -> str:
-        """Which frames are to come, counted from 1."""
-        return f"{self.position + 1} .. {self._total} lie ahead" if self.position < self._total else "none lies ahead"
+        """Which frames are to come."""
+        return f"{self.position} .. {self._total - 1} lie ahead" if self.position < self._total else "none lies ahead"
 
     def _enqueue(self, command_id: int, command: RequestMesh | RequestPictures | Export) -> None:
         if isinstance(command, Export) and command.format not in ("", *EXPORTS.get(command.kind, ())):
