@@ -359,6 +359,11 @@ def test_the_mesh_mode_in_force_is_marked(replay_page):
     assert mode.value == "Wireframe"
 
 
+def test_the_voxel_size_of_a_mesh_is_asked_for_only_where_one_is_made(page, replay_page):
+    assert control(page, "Voxel size (cm)")[1].visible
+    assert not control(replay_page, "Voxel size (cm)")[1].visible
+
+
 def test_live_only_controls_are_absent_from_a_replay(replay_page):
     for label in ("Run", "Restart", "Mapping iterations", "Pause on loop closure"):
         with pytest.raises(KeyError):
