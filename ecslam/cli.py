@@ -284,8 +284,11 @@ def resolve_config(
     resolved = configuration.for_layout(configuration.load_preset(preset), layout)
     if file is not None:
         resolved = configuration.load_config(file, resolved)
-    direct = [f"{k}={v}" for k, v in (("seed", seed), ("schedule", schedule)) if v is not None]
-    return configuration.apply_settings(resolved, [*(settings or []), *direct])
+    resolved = configuration.apply_settings(resolved, settings or [])
+    for key, value in (("seed", seed), ("schedule", schedule)):
+        if value is not None:
+            resolved = configuration.apply(resolved, {key: value}, f"--{key}")
+    return resolved
 
 
 def main() -> None:
