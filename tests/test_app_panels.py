@@ -149,6 +149,21 @@ def test_a_new_run_hides_what_the_last_one_drew(engine, page):
     assert scene._frusta.visible
 
 
+def test_a_new_run_of_equal_length_brings_its_own_truth_and_camera(engine, page):
+    scene, s = page.hub.scene, engine.skip_to(20).snapshot()
+    assert until(lambda: page.hub.current is engine.latest())
+    scene.update(s)
+    moved = s.trajectory_gt.copy()
+    moved[:, :3, 3] += 1.0
+    truth, corners = scene._lines["trajectory/ground truth"].points.copy(), scene._frusta.vertices.copy()
+    other = replace(s, frame=0, trajectory_gt=moved, fov_y_rad=0.5, aspect=2.0)
+    scene.begin(other)
+    scene.update(other)
+    assert np.allclose(scene._lines["trajectory/ground truth"].points, truth + 1.0, atol=1e-5)
+    assert (scene._camera.fov, scene._camera.aspect) == (0.5, 2.0)
+    assert not np.allclose(scene._frusta.vertices, corners)
+
+
 def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
     engine = FakeEngine(tmp_path / "run", frames=60)
     engine.run_folder.mkdir()
