@@ -53,7 +53,8 @@ class ReplayEngine:
         self.sequences = (str(run.summary.get("sequence", run.name)),)
         self.history = history_of(run.rows)
         self._past = Past(run.rows, run.trajectory)
-        self._frame, self._playing, self._period = len(run.rows) - 1, False, 1 / FRAMES_PER_S
+        self._rows = np.array([run.row_at(frame) for frame in range(run.last + 1)])
+        self._frame, self._playing, self._period = run.last, False, 1 / FRAMES_PER_S
         self._inbox: queue.SimpleQueue[tuple[int, Command] | None] = queue.SimpleQueue()
         self._ids, self._lock = 0, threading.Lock()
         self._shown_mesh: Path | None = None
@@ -107,13 +108,12 @@ class ReplayEngine:
             self._feed.publish(Ack(*item, error))
 
     def _obey(self, number: int, command: Command) -> None:
-        last = len(self.run.rows) - 1
         if isinstance(command, (Pause, Quit)):
             self._playing = False
             self._go_to(self._frame)
         elif isinstance(command, Resume):
             self._playing = True
-            self._go_to(0 if self._frame >= last else self._frame)
+            self._go_to(0 if self._frame >= self.run.last else self._frame)
         elif isinstance(command, Step):
             self._playing = False
             self._go_to(self._frame + 1)
@@ -131,29 +131,27 @@ class ReplayEngine:
 
     def _show_mesh(self) -> None:
         """Publish the mesh of the frame on show, if it is not the one that was published last."""
-        frame = int(self.run.rows[self._frame]["frame"])
-        path = self.run.mesh_at(frame)
+        path = self.run.mesh_at(self._frame)
         if path is None or path == self._shown_mesh or not self._feed.watched:
             return
         self._shown_mesh = path
         before, self._problem = self._problem, ""
         try:
-            self._feed.publish(MeshReady(frame, 0.0, drawable_mesh(path)))
+            self._feed.publish(MeshReady(self._frame, 0.0, drawable_mesh(path)))
         except InputError as error:
             self._problem = str(error)
         if self._problem != before:
             self._feed.publish(self._snapshot())
 
     def _go_to(self, frame: int) -> None:
-        last = len(self.run.rows) - 1
-        self._frame = min(max(frame, 0), last)
-        self._playing = self._playing and self._frame < last
+        self._frame = min(max(frame, 0), self.run.last)
+        self._playing = self._playing and self._frame < self.run.last
         self._feed.publish(self._snapshot())
 
     def _snapshot(self) -> Snapshot:
-        run, i = self.run, self._frame
-        row, frame = run.rows[i], int(run.rows[i]["frame"])
-        state = State.TRACKING if self._playing else State.FINISHED if i == len(run.rows) - 1 else State.PAUSED
+        run, frame, i = self.run, self._frame, int(self._rows[self._frame])
+        row = run.rows[i]
+        state = State.TRACKING if self._playing else State.FINISHED if frame == run.last else State.PAUSED
         trajectory = self._past.trajectory(i)
         keyframes = tuple(
             replace(k, c2w=trajectory[at]) for k, at in zip(run.keyframes, self._past.keyframes, strict=True) if at <= i
@@ -163,10 +161,10 @@ class ReplayEngine:
             state=state,
             sequence=self.sequences[0],
             preset=str(run.summary.get("preset", "")),
-            frame=i,
-            frames_total=len(run.rows),
-            trajectory=trajectory,
-            trajectory_gt=run.trajectory_gt,
+            frame=frame,
+            frames_total=run.last + 1,
+            trajectory=trajectory[self._rows[: frame + 1]],
+            trajectory_gt=None if run.trajectory_gt is None else run.trajectory_gt[self._rows],
             keyframes=keyframes,
             window=tuple(mapped.get("window") or ()),
             color=_decoded(keyframes[-1].jpeg()) if keyframes else None,

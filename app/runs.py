@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from bisect import bisect_right
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -26,7 +27,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run. rows: one dictionary a frame, as in ``metrics.jsonl``. meshes: path by frame."""
+    """A finished run. rows: one dictionary for each frame that was not skipped, as in ``metrics.jsonl``; timestamps and
+    both trajectories go with them. meshes: path by frame."""
 
     folder: Path
     summary: dict[str, Any]
@@ -44,6 +46,15 @@ class Run:
     def name(self) -> str:
         """How the run is called on the page."""
         return self.folder.resolve().name
+
+    @property
+    def last(self) -> int:
+        """The number of the last frame."""
+        return int(self.rows[-1]["frame"])
+
+    def row_at(self, frame: int) -> int:
+        """Which row is ``frame``'s, or the last one before it where that was skipped."""
+        return max(bisect_right(self.rows, frame, key=lambda row: int(row["frame"])) - 1, 0)
 
     def mesh_at(self, frame: int) -> Path | None:
         """The newest mesh made at or before ``frame``, else the oldest there is."""

@@ -78,6 +78,27 @@ def test_scrubbing_shows_what_was_there_at_that_frame(replay, frame):
     assert set(s.window) <= {k.frame for k in s.keyframes}
 
 
+def test_a_run_with_skipped_frames_is_shown_by_frame_number(folder, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_text("".join(lines[:11] + lines[14:]))  # without the frames 11, 12 and 13
+    whole, engine = load_run(folder), ReplayEngine(load_run(run))
+    try:
+        assert engine.latest().frame == FRAMES - 1
+        assert engine.latest().frames_total == FRAMES
+        for frame, seen in ((12, 10), (14, 14), (36, 36)):
+            events(engine, m.Snapshot, m.RunTo(frame))
+            s = engine.latest()
+            assert (s.frame, len(s.trajectory)) == (frame, frame + 1)
+            assert np.allclose(s.trajectory[-1], whole.trajectory[seen])
+            assert np.allclose(s.trajectory_gt[frame], whole.trajectory_gt[seen])
+            assert [k.frame for k in s.keyframes] == list(range(0, frame + 1, 5))
+            assert len(s.loops) == (frame >= 36)
+    finally:
+        engine.close()
+
+
 def test_past_poses_are_those_of_the_frame(folder):
     """Every keyframe is moved by a known amount at row 6; what hangs on it moves along, and only from then on."""
     rows = [dict(row, window=(), window_c2w=()) for row in load_run(folder).rows[:8]]

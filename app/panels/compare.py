@@ -51,7 +51,7 @@ class Panel(BasePanel):
         hub.on(self._mesh_of, lambda event: hub.submit(RequestMesh(0.0)))
 
     def snapshot(self, s: Snapshot) -> None:
-        self.hub.scene.compare(self._past.trajectory(min(s.frame, len(self._other.rows) - 1))[:, :3, 3])
+        self.hub.scene.compare(self._past.trajectory(self._other.row_at(s.frame))[:, :3, 3])
 
     def event(self, event: Event) -> None:
         """A mesh of the first run has come; show the second one's of that frame instead where it is wanted."""

@@ -21,7 +21,7 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
-        gui, last = hub.server.gui, len(hub.replay.run.rows) - 1 if hub.replay else 0
+        gui, last = hub.server.gui, hub.replay.run.last if hub.replay else 0
         self._slider = gui.add_slider("Frame", 0, max(last, 1), 1, last)
         self._asked: int | None = None
         hub.on(self._slider, lambda event: self._go_to(int(self._slider.value)))
