@@ -1,6 +1,7 @@
 """Every command does what it says; all are acknowledged at once, also in the middle of a long mapping."""
 
 import json
+import re
 import threading
 import time
 import zipfile
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from fake_slam import Behaviour, FakeSequence
+from fake_slam import QUICK, Behaviour, FakeSequence
 from runtime_watch import Watch, running
 
 from ecslam import config as configuration
@@ -56,7 +57,7 @@ def test_step_and_run_to_process_exactly_the_frames_asked_for(tmp_path):
         assert watch.ask(RunTo(3)).error == "cannot run to frame 3; 10 .. 29 lie ahead"
         assert "lie ahead" in watch.ask(RunTo(30)).error
         assert len(watch.go(Resume(), State.FINISHED).trajectory) == 30
-        for command in (Pause(), Resume(), Step(), RunTo(3), Stop()):
+        for command in (Pause(), Resume(), Step(), RunTo(3)):
             assert watch.ask(command).error == "the run is over; restart it"
 
 
@@ -122,6 +123,20 @@ def test_leaving_abandons_the_last_mapping_which_can_be_made_up_for(tmp_path, co
         assert not made[0].finished
     assert json.loads((tmp_path / "r/summary.json").read_text())["frames"] == 3
     assert not load_checkpoint(tmp_path / "r/checkpoints").meta["finished"]
+
+
+def test_the_last_mapping_says_how_far_it_is_and_a_second_stop_leaves_out_the_rest(tmp_path):
+    behaviour = Behaviour(final_interrupts=100_000, pause_s=0.001)
+    with running(tmp_path, FakeSequence(9), behaviour, paused_at=3) as (_, watch, made):
+        assert watch.ask(Stop()).error == ""
+        told = watch.until(lambda m: isinstance(m, Snapshot) and m.reason).reason
+        total = QUICK.mapping.iterations + QUICK.mapping.final_iterations
+        assert re.fullmatch(rf"Last mapping \d+/{total}; Stop leaves out the rest", told)
+        last = watch.go(Stop(), State.FINISHED)
+        assert (len(last.trajectory), last.reason) == (3, "")
+        assert not made[0].finished
+        assert (tmp_path / "mesh.ply").stat().st_size > 1000
+        assert watch.ask(Stop()).error == "", "it has been done already"
 
 
 def test_a_mesh_comes_within_five_seconds_even_during_the_first_mapping(tmp_path):

@@ -137,11 +137,12 @@ class Control:
             self._changed.notify_all()
 
     def _steer(self, command: Pause | Resume | Step | RunTo | Stop) -> None:
-        self._require_run()
         if isinstance(command, Stop):
             self._stop = True
             self._leave_at = min(self._leave_at, monotonic() + GRACE_S)
-        elif isinstance(command, RunTo):
+            return
+        self._require_run()
+        if isinstance(command, RunTo):
             if not self.position <= command.frame < self._total:
                 raise InputError(f"cannot run to frame {command.frame}; {self._ahead()}")
             self._paused, self._pause_at = False, command.frame + 1
@@ -245,7 +246,7 @@ class Control:
     def wait_for(self, done: Callable[[], bool]) -> bool:
         """Wait until ``done`` answers True; False when a restart or the end of the engine comes first. See ``wake``."""
         with self._changed:
-            self._changed.wait_for(lambda: done() or self.leaving)
+            self._changed.wait_for(lambda: done() or self.quitting or self._restart is not None)
             return done()
 
     def wake(self) -> None:
@@ -281,8 +282,9 @@ class Control:
 
     @property
     def leaving(self) -> bool:
-        """Whether the run's last mapping is to be left out: a restart or the end of the engine waits for it."""
-        return self.quitting or self._restart is not None
+        """Whether the run's last mapping is to be left out: a restart or the end of the engine waits for it, or it has
+        been stopped itself."""
+        return self.quitting or self._restart is not None or (self.over and self._stop)
 
     @property
     def leave_now(self) -> bool:

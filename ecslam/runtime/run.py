@@ -76,6 +76,7 @@ class Run:
         self.report: StepReport | None = None
         self.ate_cm: Spread | None = None
         self.map_loss: float | None = None
+        self.last_mapping = ""
         self.loops: list[LoopEvent] = []
         self._emit, self._make = emit, make
         self._checkpoints = CheckpointWriter(
@@ -339,7 +340,7 @@ class Run:
         """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock."""
         if complete and self.slam is not None and self.tally.rows and not self.torn and not self._settled:
             try:
-                self.slam.finish(interrupt)
+                self.slam.finish(self._counted(interrupt))
             except Abandoned:
                 complete = False
         self.clock.pause()
@@ -348,6 +349,21 @@ class Run:
         self.write_trajectory()
         self.checkpoint(finished=complete)
         self._checkpoints.wait()
+
+    def _counted(self, interrupt: Callable[[], None]) -> Callable[[], None]:
+        """``interrupt`` for the last mapping, which also says how far that is (not on a GPU, where an iteration has no
+        call of its own)."""
+        mapping, done = self.config.mapping, 0
+        total = mapping.iterations + mapping.final_iterations
+
+        def counted() -> None:
+            nonlocal done
+            done += 1
+            how_far = f" {done}/{total}" if self.plan.device == "cpu" else ""
+            self.last_mapping = f"Last mapping{how_far}; Stop leaves out the rest"
+            interrupt()
+
+        return counted
 
     def close(self, export_s: float) -> dict[str, Any]:
         """Write ``summary.json`` and close the logs; the summary comes back. ``end`` has been called before."""
