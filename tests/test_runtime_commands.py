@@ -191,6 +191,8 @@ def test_tune_and_load_preset_reach_the_engine(tmp_path):
         assert exported["tracking"]["rays"] == 2000
     log = (tmp_path / "events.jsonl").read_text()
     assert "mapping.iterations = 40 from frame 3 on" in log
+    assert "preset full from frame 4 on" in log
+    assert configuration.load_config(tmp_path / "config.yaml") == made[0].config
 
 
 def test_steps_asked_for_while_one_is_at_work_add_up():

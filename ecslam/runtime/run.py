@@ -254,8 +254,9 @@ class Run:
             return_holes()
 
     def configure(self, config: Config) -> None:
-        """Other tracking and mapping settings from the next frame on."""
+        """Other tracking and mapping settings from the next frame on; ``config.yaml`` holds the newest ones."""
         self.config = config
+        self.folder.write("config.yaml", configuration.to_yaml(config))
         if self.slam is not None:
             self.slam.configure(config)
 
