@@ -77,12 +77,11 @@ def run(
     resolved = resolve_config(preset or opened.preset, opened.layout, config, settings, seed, schedule)
     folder = out or commands.unused(Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}")
     offered = commands.offered(data or [])
-    if not headless:
-        commands.require_port(host, port)
+    listener = None if headless else commands.listen(host, port)
     engine = commands.make_engine(
         resolved, sequence, opened, folder, commands.pick_device(device, resolved), frames, offered
     )
-    commands.start(engine, headless, host, port, not no_browser)
+    commands.start(engine, listener, host, not no_browser)
 
 
 @app.command()
@@ -125,10 +124,9 @@ def resume(
     """Go on with an interrupted run from its last checkpoint."""
     from . import commands
 
-    if not headless:
-        commands.require_port(host, port)
+    listener = None if headless else commands.listen(host, port)
     engine = commands.resume_engine(folder, commands.pick_device(device), sequence)
-    commands.start(engine, headless, host, port, not no_browser)
+    commands.start(engine, listener, host, not no_browser)
 
 
 @app.command()

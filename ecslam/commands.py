@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import sys
 import tempfile
 import threading
@@ -118,22 +119,23 @@ def resume_engine(folder: Path, device: str, sequence: str | None) -> Engine:
     return Engine.resume(folder, device=device, sequences=BUILT_IN, sequence=moved)
 
 
-def require_port(host: str, port: int) -> None:
-    """Raises InputError when the dashboard could not listen there, before a run folder is touched."""
-    from ecslam_app.front import bind
+def listen(host: str, port: int) -> socket.socket:
+    """The dashboard's socket, before a run folder is touched. Raises InputError when it cannot listen there."""
+    from ecslam_app.listen import bind
 
-    bind(host, port).close()
+    return bind(host, port)
 
 
-def start(engine: Engine, headless: bool, host: str, port: int, browser: bool) -> None:
-    """Run to the end, with or without the dashboard. The engine proper is imported while the first frames are read."""
+def start(engine: Engine, listener: socket.socket | None, host: str, browser: bool) -> None:
+    """Run to the end, under the dashboard where there is a ``listener`` (on ``host``) for it. The engine proper is
+    imported while the first frames are read."""
     importing = threading.Thread(target=import_slam, name="import", daemon=True)
     importing.start()
     try:
-        if headless:
+        if listener is None:
             run_headless(engine)
         else:
-            run_with_dashboard(engine, host, port, browser)
+            run_with_dashboard(engine, listener, host, browser)
     finally:
         importing.join()
 
@@ -175,13 +177,13 @@ def progress_line(s: Snapshot, window: int, wide: bool = True) -> str:
     return "  ".join(figures)
 
 
-def run_with_dashboard(engine: Engine, host: str, port: int, browser: bool) -> None:
+def run_with_dashboard(engine: Engine, listener: socket.socket, host: str, browser: bool) -> None:
     """Run in the background under the dashboard until Ctrl-C; a finished run is reported while the page stays up."""
     from ecslam_app import server
 
     reports = Reports(engine)
     with quit_on_signals(engine):
-        dashboard = server.start(engine, host, port)
+        dashboard = server.start(engine, host, listener=listener)
         _announce(dashboard, browser, "everything but an unfinished run's mesh is saved first")
         engine.start(reports.watch)
         engine.join()

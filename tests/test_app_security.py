@@ -10,6 +10,7 @@ import msgspec
 import pytest
 import viser
 from ecslam_app import front, guard, server
+from ecslam_app.listen import bind
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -285,4 +286,4 @@ def test_a_viser_that_cannot_be_guarded_is_not_used(monkeypatch):
         front._Shell, "serve", lambda self, serve, handler, host, port, **rest: serve(handler, "127.0.0.1", 0, **rest)
     )
     with pytest.raises(RuntimeError, match="cannot be guarded"):
-        front.open_viser(front.bind("127.0.0.1", 0), "127.0.0.1", None, "x")
+        front.open_viser(bind("127.0.0.1", 0), "127.0.0.1", None, "x")

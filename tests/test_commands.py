@@ -1,5 +1,8 @@
 """What the command line says while the dashboard is up."""
 
+from urllib.request import urlopen
+
+from ecslam_app import server
 from fake_slam import Behaviour, FakeSequence
 from runtime_watch import running
 
@@ -35,3 +38,14 @@ def test_a_run_that_was_left_early_says_how_to_get_its_mesh(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert f"ecslam mesh {tmp_path / 'r'} makes it" in said
     assert f"ecslam resume {tmp_path / 'r'} goes on" in said
+
+
+def test_the_port_that_was_found_free_is_the_one_that_the_page_has(tmp_path):
+    listener = commands.listen("127.0.0.1", 0)
+    found = listener.getsockname()[1]
+    with running(tmp_path / "r", paused_at=1) as (engine, _, __):
+        page = server.start(engine, port=1, listener=listener)
+        with urlopen(page.url) as answer:
+            assert b"EC-SLAM" in answer.read()
+        page.close()
+    assert page.port == found

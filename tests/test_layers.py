@@ -150,6 +150,11 @@ def test_a_headless_engine_starts_without(library):
     assert library not in reached("ecslam.commands") | reached("ecslam.runtime.engine") | reached("ecslam.slam")
 
 
+def test_a_port_is_found_busy_without_viser():
+    assert "viser" not in reached("ecslam_app.listen")
+    assert "viser" in reached("ecslam_app.server")
+
+
 def test_heavy_libraries_stay_behind_their_seams():
     assert all(m.startswith("ecslam_app") for m in users_of("viser"))
     for library in ("numba", "triton", "llvmlite"):
