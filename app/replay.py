@@ -6,7 +6,6 @@ import queue
 import shutil
 import threading
 import time
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ecslam.datasets.meshes import load_mesh
+from ecslam.evaluation.trajectory_io import format_kitti, format_tum
 from ecslam.messages import (
     Ack,
     Command,
@@ -31,13 +32,14 @@ from ecslam.messages import (
     State,
     Step,
 )
+from ecslam.runtime.exports import zip_run
 from ecslam.runtime.feed import Feed, FeedSubscription
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.types import InputError
 
 from .history import history_of
 from .past import Past
-from .runs import Run, drawable_mesh, kitti_lines, load_mesh, tum_lines
+from .runs import Run, drawable_mesh
 
 FRAMES_PER_S = 20.0
 
@@ -194,24 +196,18 @@ def export(run: Run, command: Export) -> Path:
         return path
     if command.kind == "trajectory":
         path = folder / f"trajectory_{command.format or 'tum'}.txt"
-        path.write_text(
-            kitti_lines(run.trajectory) if command.format == "kitti" else tum_lines(run.timestamps, run.trajectory)
-        )
+        kitti = command.format == "kitti"
+        path.write_text(format_kitti(run.trajectory) if kitti else format_tum(run.timestamps, run.trajectory))
         return path
     if command.kind == "keyframes":
         path = folder / "keyframes.txt"
-        times = np.interp([k.frame for k in run.keyframes], [r["frame"] for r in run.rows], run.timestamps)
-        path.write_text(tum_lines(times, np.array([k.c2w for k in run.keyframes]).reshape(-1, 4, 4)))
+        rows = [run.row_at(keyframe.frame) for keyframe in run.keyframes]
+        path.write_text(format_tum(run.timestamps[rows], run.trajectory[rows]))
         return path
     if command.kind == "config" and (run.folder / "config.yaml").is_file():
         return Path(shutil.copyfile(run.folder / "config.yaml", folder / "config.yaml"))
     if command.kind == "run":
-        path = folder / f"{run.name}.zip"
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            for file in sorted(run.folder.rglob("*")):
-                if file.is_file() and folder not in file.parents:
-                    archive.write(file, file.relative_to(run.folder))
-        return path
+        return zip_run(run.folder, f"exports/{run.name}.zip")
     raise InputError(f"{run.folder}: this run holds no {command.kind} to export")
 
 

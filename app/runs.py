@@ -1,4 +1,4 @@
-"""Reading a finished run's folder, and the two text formats for trajectories."""
+"""Reading a finished run's folder."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import viser.transforms as vt
 from numpy.typing import NDArray
 
+from ecslam.datasets.meshes import load_mesh
 from ecslam.messages import KeyframeView, LoopEvent
 from ecslam.runtime.files import read_lines
 from ecslam.types import InputError, Mesh
 
-from .geometry import wxyz
 from .glb import simplify
 
 Array = NDArray[np.float64]
@@ -98,36 +97,10 @@ def frame_rows(folder: Path) -> tuple[dict[str, Any], ...]:
     return tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
 
 
-def load_mesh(path: Path) -> Mesh:
-    """A mesh file as our type. Raises InputError when it cannot be read."""
-    try:
-        loaded: Any = trimesh.load_mesh(path, process=False)
-    except (OSError, ValueError, LookupError) as error:
-        raise InputError(f"{path}: not a readable mesh ({error}); make it again with `ecslam mesh`") from None
-    coloured = loaded.visual is not None and loaded.visual.kind == "vertex"
-    colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(np.uint8) if coloured else None
-    return Mesh(np.asarray(loaded.vertices, np.float32), np.asarray(loaded.faces, np.int32), colors)
-
-
 @lru_cache(12)
 def drawable_mesh(path: Path) -> Mesh:
     """A mesh file within the triangle budget; remembered, as scrubbing comes back to it. Raises InputError."""
     return simplify(load_mesh(path))
-
-
-def tum_lines(timestamps: Array, c2w: Array) -> str:
-    """``timestamp tx ty tz qx qy qz qw`` a line; frames without a pose are left out."""
-    out = []
-    for t, pose in zip(timestamps, c2w, strict=True):
-        if np.isfinite(pose).all():
-            w, x, y, z = wxyz(pose)
-            out.append(f"{t:.6f} " + " ".join(f"{v:.7f}" for v in (*pose[:3, 3], x, y, z, w)))
-    return "\n".join(out) + "\n"
-
-
-def kitti_lines(c2w: Array) -> str:
-    """The upper three rows of every pose, row by row, twelve numbers a line."""
-    return "".join(" ".join(f"{v:.9g}" for v in pose[:3].ravel()) + "\n" for pose in c2w)
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from ecslam_app.panels.compare import figures_table
 from ecslam_app.past import Past
 from ecslam_app.record import html_replay
 from ecslam_app.replay import ReplayEngine
-from ecslam_app.runs import kitti_lines, load_mesh, load_run, tum_lines
+from ecslam_app.runs import load_run
 
 from ecslam import messages as m
 from ecslam.runtime.protocol import EngineHandle
@@ -163,12 +163,16 @@ def test_exports(replay, folder):
     mesh = trimesh.load_mesh(events(replay, m.Exported, m.Export("mesh", "ply"))[0].path, process=False)
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
     tum = np.loadtxt(events(replay, m.Exported, m.Export("trajectory", "tum"))[0].path)
-    assert np.allclose(tum[:, 1:4], load_run(folder).trajectory[:, :3, 3], atol=1e-6)
+    assert np.array_equal(tum[:, 1:4], load_run(folder).trajectory[:, :3, 3]), "not a digit is lost"
     kitti = np.loadtxt(events(replay, m.Exported, m.Export("trajectory", "kitti"))[0].path)
-    assert np.allclose(kitti.reshape(-1, 3, 4), load_run(folder).trajectory[:, :3])
+    assert np.array_equal(kitti.reshape(-1, 3, 4), load_run(folder).trajectory[:, :3])
+    keyframes = np.loadtxt(events(replay, m.Exported, m.Export("keyframes"))[0].path)
+    assert np.array_equal(keyframes, tum[::5])
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "000039.safetensors").write_bytes(b"large")
     with zipfile.ZipFile(events(replay, m.Exported, m.Export("run", "zip"))[0].path) as archive:
-        assert {"metrics.jsonl", "mesh.ply", "summary.json"} <= set(archive.namelist())
-        assert not any(name.startswith("exports") for name in archive.namelist())
+        assert {f"lite/{name}" for name in ("metrics.jsonl", "mesh.ply", "summary.json")} <= set(archive.namelist())
+        assert not any(name.startswith(("lite/exports", "lite/checkpoints")) for name in archive.namelist())
 
 
 def test_a_comparison_says_which_path_is_whose(folder):
@@ -211,13 +215,6 @@ def test_html_replay_is_one_file_without_addresses_of_others(replay, tmp_path):
     page = html_replay(replay.latest(), room_mesh(0.3), replay.history, dark=False)
     assert "__VISER_EMBED_DATA__" in page
     assert "http://localhost" not in page
-
-
-def test_tum_lines_leave_out_what_is_missing():
-    poses = walk(4)
-    poses[2] = np.nan
-    assert len(tum_lines(np.arange(4), poses).splitlines()) == 3
-    assert len(kitti_lines(walk(4)).splitlines()) == 4
 
 
 # ---- what is drawn ------------------------------------------------------------------------------------------------
@@ -310,9 +307,3 @@ def test_history_thins_and_fills_gaps():
     assert len(frames) <= 101
     assert np.isnan(ate[frames % 2 == 0]).all()
     assert history.window_at(57) == (50,)
-
-
-def test_load_mesh_refuses_what_is_none(tmp_path):
-    (tmp_path / "mesh.ply").write_text("ply\nnonsense")
-    with pytest.raises(InputError, match="mesh"):
-        load_mesh(tmp_path / "mesh.ply")
