@@ -260,7 +260,7 @@ class Hub:
             self.scene.set_mesh(message)
             self.views.keep_framed()
         elif isinstance(message, Exported):
-            self._exported(message.command_id or -1, Path(message.path))
+            self._exported(message, message.command_id or -1)
         elif isinstance(message, Notice):
             self._notice(message)
         elif isinstance(message, LoopEvent):
@@ -268,11 +268,14 @@ class Hub:
         for panel in self.panels:
             panel.event(message)
 
-    def _exported(self, command_id: int, path: Path) -> None:
+    def _exported(self, message: Exported, command_id: int) -> None:
         asker, note = self._askers.pop(command_id, None), self._under_way.pop(command_id, None)
         if note is not None:
             note.remove()
-        self.jobs.submit(self.deliver, asker, path)
+        if message.error:
+            self.toast("Not exported", f"{message.kind}: {message.error}", "red", asker)
+        else:
+            self.jobs.submit(self.deliver, asker, Path(message.path))
 
     def _notice(self, notice: Notice) -> None:
         now = time.monotonic()

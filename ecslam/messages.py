@@ -157,11 +157,13 @@ class MeshReady:
 
 @dataclass(frozen=True)
 class Exported:
-    """A file was written. kind: ``mesh``, ``trajectory``, ...; path: where it lies; command_id: who asked for it."""
+    """A file was written. kind: ``mesh``, ``trajectory``, ...; path: where it lies; command_id: who asked for it;
+    error: why there is none, else ""."""
 
     kind: str
     path: str
     command_id: int | None = None
+    error: str = ""
 
 
 @dataclass(frozen=True)

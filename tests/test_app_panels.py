@@ -251,6 +251,22 @@ def test_a_run_that_is_over_offers_no_steering_until_a_restart(engine, page, end
     assert not control(page, "Restart")[1].disabled
 
 
+def test_an_export_that_fails_is_no_longer_under_way(page, engine, monkeypatch):
+    told = []
+    monkeypatch.setattr(page.hub, "toast", lambda title, text, color, client=None: told.append((title, text)))
+    monkeypatch.setattr(engine, "_carry_out", lambda number, command: None)
+    engine.start()
+    with dial(page) as client:
+        enter(client)
+        assert until(lambda: list(page.hub.viewers()))
+        press(page, client, "Export keyframes", True)
+        assert until(lambda: page.hub._under_way)
+        (number,) = page.hub._under_way
+        engine._feed.publish(m.Exported("keyframes", "", number, "No space left on device"))
+        assert until(lambda: ("Not exported", "keyframes: No space left on device") in told)
+        assert page.hub._under_way == {}
+
+
 def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, page):
     panel = next(p for p in page.hub.panels if p.tab == "Pictures")
     s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)

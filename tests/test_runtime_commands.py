@@ -317,6 +317,21 @@ def test_exports_are_files_that_other_programs_read(tmp_path):
         assert "cannot export" in watch.ask(Export("passwords")).error
 
 
+def test_an_export_that_fails_says_so_to_who_asked_for_it(tmp_path):
+    with running(tmp_path, paused_at=0) as (_, watch, __):
+
+        def failure(*args) -> str:
+            number = watch.ask(Export(*args)).command_id
+            told = watch.until(lambda m: isinstance(m, Exported) and m.command_id == number)
+            assert told.path == ""
+            return told.error
+
+        assert "no map yet" in failure("mesh", "ply")
+        (tmp_path / "exports").write_text("in the way")
+        assert "exists" in failure("trajectory", "tum")
+        assert "exists" in failure("run", "zip")
+
+
 def test_a_finished_run_still_exports_and_quits(tmp_path):
     with running(tmp_path) as (engine, watch, _):
         watch.state(State.FINISHED)

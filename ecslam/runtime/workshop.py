@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..messages import Command, Export, MeshReady, Notice, RequestMesh, RequestPictures
+from ..messages import Command, Export, Exported, MeshReady, Notice, RequestMesh, RequestPictures
 from ..types import Frame, InputError
 from .control import Control
 from .exports import export_job, render_pictures
@@ -62,7 +62,10 @@ class Workshop:
                 elif isinstance(command, Export):
                     self._jobs.submit(export_job(run, command, command_id, frozen, self._feed.publish, self._leaving))
             except (InputError, OSError) as error:
-                self._complain(str(error))
+                if isinstance(command, Export):
+                    self._feed.publish(Exported(command.kind, "", command_id, str(error)))
+                else:
+                    self._complain(str(error))
 
     def _mesh_job(self, frozen: FrozenMap, order: RequestMesh) -> Callable[[], None]:
         return lambda: self._feed.publish(build_mesh(frozen, order.voxel_m, order.max_triangles, self._leaving))
