@@ -16,7 +16,7 @@ from ..hub import Hub
 from ..panel import BasePanel
 
 EVERY_S = 0.5
-HEIGHT = 150
+HEIGHT, NEAR_PX = 150, 10
 _RESIDUAL = "_mm"  # ends the names of what is measured in millimetres and therefore no loss
 _PALETTE = (theme.ESTIMATE, theme.TRUTH, theme.WINDOW, theme.LOOP, (234, 179, 8), theme.BEFORE, theme.KEYFRAME)
 # Its class keeps it out of the legend and without a point under the mouse.
@@ -44,7 +44,9 @@ class Chart:
             title=title,
             height=HEIGHT,
             axes=_axes(),
-            cursor=uplot.Cursor(drag=uplot.Cursor_Drag(x=False, y=False)),
+            cursor=uplot.Cursor(
+                drag=uplot.Cursor_Drag(x=False, y=False), hover=uplot.Cursor_Hover(prox=NEAR_PX, skip=(np.nan,))
+            ),
             padding=(6, 14, 0, 0),
             visible=False,
         )
