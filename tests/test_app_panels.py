@@ -198,6 +198,12 @@ def test_the_slider_of_a_replay_follows_wherever_it_goes(replay_page):
     assert until(lambda: slider.value == 21)
 
 
+def test_a_replay_announces_nothing_that_it_has_done_already(replay_page):
+    status = Status(replay_page.hub)
+    status.ack(m.Ack(1, m.RunTo(11)))
+    assert "Running on" not in status._html.content
+
+
 def test_the_plots_of_a_replay_mark_the_frame_that_is_shown(replay_page):
     chart = next(p for p in replay_page.hub.panels if p.tab == "Plots")._error
     for frame in (4, 23):

@@ -58,8 +58,9 @@ class Panel(BasePanel):
         self._html.content = render(s, _COMING[type(self._halting)] if self._halting else "")
 
     def ack(self, ack: Ack) -> None:
-        """Answer at once; a halt that waits for the frame at work keeps its word until it has come about."""
-        if ack.error or type(ack.command) not in _COMING:
+        """Answer at once; a halt that waits for the frame at work keeps its word until it has come about. A replay has
+        done what it acknowledges."""
+        if ack.error or type(ack.command) not in _COMING or self.hub.replay is not None:
             return
         halts = isinstance(ack.command, (Pause, Stop))
         if halts and self.hub.current is not None and self.hub.current.state in _SETTLED:
