@@ -41,6 +41,7 @@ def page(engine):
 @pytest.fixture(scope="module")
 def replay_page(tmp_path_factory):
     page = server.view([write_run(tmp_path_factory.mktemp("runs") / "a", 30)], port=0)
+    assert until(lambda: page.hub.current is not None)
     yield page
     page.close()
 
