@@ -29,8 +29,6 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from ecslam.types import InputError
-
 from .broadcast import share_batches
 from .guard import make_check
 from .page import index_page
@@ -87,30 +85,6 @@ class Door:
 def is_loopback(host: str) -> bool:
     """Whether only this machine can reach ``host``."""
     return host in _LOOPBACK_NAMES or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
-
-
-def bind(host: str, port: int) -> socket.socket:
-    """A listening socket (``port`` 0: any free one). Raises InputError when the port is busy or the host not ours."""
-    if not 0 <= port <= 65535:
-        raise InputError(f"--port {port}: a port lies in 0 .. 65535; 0 takes any free one")
-    try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
-            0
-        ]
-    except OSError:
-        raise InputError(
-            f"--host {host}: no such host; 127.0.0.1 serves this machine, 0.0.0.0 all its networks"
-        ) from None
-    listener = socket.socket(family, kind)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind(address)
-        listener.listen(128)
-    except OSError as error:
-        listener.close()
-        hint = "choose another --port (0 takes any free one)" if port else "choose an address of this machine"
-        raise InputError(f"--host {host} --port {port}: cannot listen there ({error.strerror}); {hint}") from None
-    return listener
 
 
 def open_viser(listener: socket.socket, host: str, token: str | None, label: str) -> viser.ViserServer:

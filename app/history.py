@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +51,15 @@ class History:
         """The last known window at or before ``frame`` (a frame without mapping has none of its own)."""
         known = [f for f, window in self.windows.items() if f <= frame and window]
         return self.windows[max(known)] if known else ()
+
+
+def history_of(rows: Iterable[dict[str, Any]]) -> History:
+    """The figures of frames that are on record. rows: lines of ``metrics.jsonl``."""
+    history = History()
+    for row in rows:
+        figures = {name: float(row[name]) for name in FIGURES if row.get(name) is not None}
+        history.add(int(row["frame"]), figures, row.get("losses") or {}, tuple(row.get("window") or ()))
+    return history
 
 
 def discrepancy(s: Snapshot, most: int = 400) -> tuple[str, NDArray[np.float64], NDArray[np.float64]]:

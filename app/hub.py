@@ -33,9 +33,10 @@ from ecslam.runtime.protocol import EngineHandle
 
 from . import theme
 from .broadcast import downloading
-from .history import History, with_last_mapping
+from .history import History, history_of, with_last_mapping
 from .panel import TABS, BasePanel, find_panels
 from .replay import ReplayEngine
+from .runs import frame_rows
 from .scene import Scene
 from .views import Views
 
@@ -245,7 +246,7 @@ class Hub:
 
     def _begin(self, s: Snapshot) -> None:
         if self.replay is None:
-            self.history = History()
+            self.history = history_of(frame_rows(self.engine.run_folder))
         self.scene.begin(s)
         for client in self.viewers():
             self.views.show_all(client, 0.0)
@@ -259,19 +260,22 @@ class Hub:
             self.scene.set_mesh(message)
             self.views.keep_framed()
         elif isinstance(message, Exported):
-            self._exported(message.command_id or -1, Path(message.path))
+            self._exported(message, message.command_id or -1)
         elif isinstance(message, Notice):
             self._notice(message)
         elif isinstance(message, LoopEvent):
-            self.toast("Loop closed", f"Frame {message.frame + 1}: corrected by {message.correction_cm:.2f} cm", "teal")
+            self.toast("Loop closed", f"Frame {message.frame}: corrected by {message.correction_cm:.2f} cm", "teal")
         for panel in self.panels:
             panel.event(message)
 
-    def _exported(self, command_id: int, path: Path) -> None:
+    def _exported(self, message: Exported, command_id: int) -> None:
         asker, note = self._askers.pop(command_id, None), self._under_way.pop(command_id, None)
         if note is not None:
             note.remove()
-        self.jobs.submit(self.deliver, asker, path)
+        if message.error:
+            self.toast("Not exported", f"{message.kind}: {message.error}", "red", asker)
+        else:
+            self.jobs.submit(self.deliver, asker, Path(message.path))
 
     def _notice(self, notice: Notice) -> None:
         now = time.monotonic()

@@ -9,9 +9,10 @@ import numpy as np
 from ecslam.messages import MeshReady, Snapshot
 from ecslam.types import Mesh
 
-from .front import bind, close_viser, open_viser
+from .front import close_viser, open_viser
 from .geometry import overview
 from .history import History
+from .listen import bind
 from .scene import Scene
 from .views import FOV_RAD
 

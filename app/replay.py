@@ -6,7 +6,6 @@ import queue
 import shutil
 import threading
 import time
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ecslam.datasets.meshes import load_mesh
+from ecslam.evaluation.trajectory_io import format_kitti, format_tum
 from ecslam.messages import (
     Ack,
     Command,
     Export,
     Exported,
     MeshReady,
-    Notice,
     Pause,
     Quit,
     RequestMesh,
@@ -32,13 +32,14 @@ from ecslam.messages import (
     State,
     Step,
 )
+from ecslam.runtime.exports import zip_run
 from ecslam.runtime.feed import Feed, FeedSubscription
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.types import InputError
 
-from .history import FIGURES, History
+from .history import history_of
 from .past import Past
-from .runs import Run, drawable_mesh, kitti_lines, load_mesh, tum_lines
+from .runs import Run, drawable_mesh
 
 FRAMES_PER_S = 20.0
 
@@ -52,12 +53,14 @@ class ReplayEngine:
         self.run, self.others = run, others
         self.run_folder = run.folder
         self.sequences = (str(run.summary.get("sequence", run.name)),)
-        self.history = run_history(run)
+        self.history = history_of(run.rows)
         self._past = Past(run.rows, run.trajectory)
-        self._frame, self._playing, self._period = len(run.rows) - 1, False, 1 / FRAMES_PER_S
+        self._rows = np.array([run.row_at(frame) for frame in range(run.last + 1)])
+        self._frame, self._playing, self._period = run.last, False, 1 / FRAMES_PER_S
         self._inbox: queue.SimpleQueue[tuple[int, Command] | None] = queue.SimpleQueue()
         self._ids, self._lock = 0, threading.Lock()
         self._shown_mesh: Path | None = None
+        self._problem = ""
         self._feed = Feed()
         self._feed.publish(self._snapshot())
         self._thread = threading.Thread(target=self._work, name="replay", daemon=True)
@@ -107,13 +110,12 @@ class ReplayEngine:
             self._feed.publish(Ack(*item, error))
 
     def _obey(self, number: int, command: Command) -> None:
-        last = len(self.run.rows) - 1
         if isinstance(command, (Pause, Quit)):
             self._playing = False
             self._go_to(self._frame)
         elif isinstance(command, Resume):
             self._playing = True
-            self._go_to(0 if self._frame >= last else self._frame)
+            self._go_to(0 if self._frame >= self.run.last else self._frame)
         elif isinstance(command, Step):
             self._playing = False
             self._go_to(self._frame + 1)
@@ -131,26 +133,27 @@ class ReplayEngine:
 
     def _show_mesh(self) -> None:
         """Publish the mesh of the frame on show, if it is not the one that was published last."""
-        frame = int(self.run.rows[self._frame]["frame"])
-        path = self.run.mesh_at(frame)
+        path = self.run.mesh_at(self._frame)
         if path is None or path == self._shown_mesh or not self._feed.watched:
             return
         self._shown_mesh = path
+        before, self._problem = self._problem, ""
         try:
-            self._feed.publish(MeshReady(frame, 0.0, drawable_mesh(path)))
+            self._feed.publish(MeshReady(self._frame, 0.0, drawable_mesh(path)))
         except InputError as error:
-            self._feed.publish(Notice("warning", str(error), frame))
+            self._problem = str(error)
+        if self._problem != before:
+            self._feed.publish(self._snapshot())
 
     def _go_to(self, frame: int) -> None:
-        last = len(self.run.rows) - 1
-        self._frame = min(max(frame, 0), last)
-        self._playing = self._playing and self._frame < last
+        self._frame = min(max(frame, 0), self.run.last)
+        self._playing = self._playing and self._frame < self.run.last
         self._feed.publish(self._snapshot())
 
     def _snapshot(self) -> Snapshot:
-        run, i = self.run, self._frame
-        row, frame = run.rows[i], int(run.rows[i]["frame"])
-        state = State.TRACKING if self._playing else State.FINISHED if i == len(run.rows) - 1 else State.PAUSED
+        run, frame, i = self.run, self._frame, int(self._rows[self._frame])
+        row = run.rows[i]
+        state = State.TRACKING if self._playing else State.FINISHED if frame == run.last else State.PAUSED
         trajectory = self._past.trajectory(i)
         keyframes = tuple(
             replace(k, c2w=trajectory[at]) for k, at in zip(run.keyframes, self._past.keyframes, strict=True) if at <= i
@@ -160,10 +163,10 @@ class ReplayEngine:
             state=state,
             sequence=self.sequences[0],
             preset=str(run.summary.get("preset", "")),
-            frame=i,
-            frames_total=len(run.rows),
-            trajectory=trajectory,
-            trajectory_gt=run.trajectory_gt,
+            frame=frame,
+            frames_total=run.last + 1,
+            trajectory=trajectory[self._rows[: frame + 1]],
+            trajectory_gt=None if run.trajectory_gt is None else run.trajectory_gt[self._rows],
             keyframes=keyframes,
             window=tuple(mapped.get("window") or ()),
             color=_decoded(keyframes[-1].jpeg()) if keyframes else None,
@@ -179,16 +182,8 @@ class ReplayEngine:
             loops=tuple(e for e in run.loops if e.frame <= frame),
             skipped=int(run.summary.get("skipped_frames") or 0),
             lost_frames=int(run.summary.get("lost_frames") or 0),
+            reason=self._problem,
         )
-
-
-def run_history(run: Run) -> History:
-    """The figures of all frames of a run."""
-    history = History()
-    for row in run.rows:
-        figures = {name: float(row[name]) for name in FIGURES if row.get(name) is not None}
-        history.add(int(row["frame"]), figures, row.get("losses") or {}, tuple(row.get("window") or ()))
-    return history
 
 
 def export(run: Run, command: Export) -> Path:
@@ -201,24 +196,18 @@ def export(run: Run, command: Export) -> Path:
         return path
     if command.kind == "trajectory":
         path = folder / f"trajectory_{command.format or 'tum'}.txt"
-        path.write_text(
-            kitti_lines(run.trajectory) if command.format == "kitti" else tum_lines(run.timestamps, run.trajectory)
-        )
+        kitti = command.format == "kitti"
+        path.write_text(format_kitti(run.trajectory) if kitti else format_tum(run.timestamps, run.trajectory))
         return path
     if command.kind == "keyframes":
         path = folder / "keyframes.txt"
-        times = np.interp([k.frame for k in run.keyframes], [r["frame"] for r in run.rows], run.timestamps)
-        path.write_text(tum_lines(times, np.array([k.c2w for k in run.keyframes]).reshape(-1, 4, 4)))
+        rows = [run.row_at(keyframe.frame) for keyframe in run.keyframes]
+        path.write_text(format_tum(run.timestamps[rows], run.trajectory[rows]))
         return path
     if command.kind == "config" and (run.folder / "config.yaml").is_file():
         return Path(shutil.copyfile(run.folder / "config.yaml", folder / "config.yaml"))
     if command.kind == "run":
-        path = folder / f"{run.name}.zip"
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            for file in sorted(run.folder.rglob("*")):
-                if file.is_file() and folder not in file.parents:
-                    archive.write(file, file.relative_to(run.folder))
-        return path
+        return zip_run(run.folder, f"exports/{run.name}.zip")
     raise InputError(f"{run.folder}: this run holds no {command.kind} to export")
 
 

@@ -1,24 +1,24 @@
-"""Reading a finished run's folder, and the two text formats for trajectories."""
+"""Reading a finished run's folder."""
 
 from __future__ import annotations
 
 import json
 import re
+from bisect import bisect_right
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import viser.transforms as vt
 from numpy.typing import NDArray
 
+from ecslam.datasets.meshes import load_mesh
 from ecslam.messages import KeyframeView, LoopEvent
 from ecslam.runtime.files import read_lines
 from ecslam.types import InputError, Mesh
 
-from .geometry import wxyz
 from .glb import simplify
 
 Array = NDArray[np.float64]
@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run. rows: one dictionary a frame, as in ``metrics.jsonl``. meshes: path by frame."""
+    """A finished run. rows: one dictionary for each frame that was not skipped, as in ``metrics.jsonl``; timestamps and
+    both trajectories go with them. meshes: path by frame."""
 
     folder: Path
     summary: dict[str, Any]
@@ -45,6 +46,15 @@ class Run:
         """How the run is called on the page."""
         return self.folder.resolve().name
 
+    @property
+    def last(self) -> int:
+        """The number of the last frame."""
+        return int(self.rows[-1]["frame"])
+
+    def row_at(self, frame: int) -> int:
+        """Which row is ``frame``'s, or the last one before it where that was skipped."""
+        return max(bisect_right(self.rows, frame, key=lambda row: int(row["frame"])) - 1, 0)
+
     def mesh_at(self, frame: int) -> Path | None:
         """The newest mesh made at or before ``frame``, else the oldest there is."""
         past = [f for f in self.meshes if f <= frame]
@@ -55,7 +65,7 @@ def load_run(folder: Path) -> Run:
     """Read a run folder. Raises InputError when it is not one."""
     if not (folder / "metrics.jsonl").is_file():
         raise InputError(f"{folder}: not a run folder (no metrics.jsonl); give the --out folder of `ecslam run`")
-    rows = tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
+    rows = frame_rows(folder)
     if not rows:
         raise InputError(f"{folder / 'metrics.jsonl'}: holds no frame; the run ended before its first one")
     summary = _json(folder / "summary.json")
@@ -82,36 +92,15 @@ def load_run(folder: Path) -> Run:
     )
 
 
-def load_mesh(path: Path) -> Mesh:
-    """A mesh file as our type. Raises InputError when it cannot be read."""
-    try:
-        loaded: Any = trimesh.load_mesh(path, process=False)
-    except (OSError, ValueError, LookupError) as error:
-        raise InputError(f"{path}: not a readable mesh ({error}); make it again with `ecslam mesh`") from None
-    coloured = loaded.visual is not None and loaded.visual.kind == "vertex"
-    colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(np.uint8) if coloured else None
-    return Mesh(np.asarray(loaded.vertices, np.float32), np.asarray(loaded.faces, np.int32), colors)
+def frame_rows(folder: Path) -> tuple[dict[str, Any], ...]:
+    """A line for each frame that a run folder has on record so far; none where there is no ``metrics.jsonl``."""
+    return tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
 
 
 @lru_cache(12)
 def drawable_mesh(path: Path) -> Mesh:
     """A mesh file within the triangle budget; remembered, as scrubbing comes back to it. Raises InputError."""
     return simplify(load_mesh(path))
-
-
-def tum_lines(timestamps: Array, c2w: Array) -> str:
-    """``timestamp tx ty tz qx qy qz qw`` a line; frames without a pose are left out."""
-    out = []
-    for t, pose in zip(timestamps, c2w, strict=True):
-        if np.isfinite(pose).all():
-            w, x, y, z = wxyz(pose)
-            out.append(f"{t:.6f} " + " ".join(f"{v:.7f}" for v in (*pose[:3, 3], x, y, z, w)))
-    return "\n".join(out) + "\n"
-
-
-def kitti_lines(c2w: Array) -> str:
-    """The upper three rows of every pose, row by row, twelve numbers a line."""
-    return "".join(" ".join(f"{v:.9g}" for v in pose[:3].ravel()) + "\n" for pose in c2w)
 
 
 def _json(path: Path) -> dict[str, Any]:

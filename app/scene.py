@@ -57,7 +57,6 @@ class Scene:
         self.points = np.array([[-1.0, -1, -1], [1, 1, 1]])
         self.up, self._back = np.array([0.0, 0.0, 1.0]), np.array([0.8, -0.6, 0.0])
         self._best_side: NDArray[np.float64] | None = None
-        self.fov_y, self.aspect = 0.9, 4 / 3
         server.scene.configure_default_lights(cast_shadow=False)
         self._grid = server.scene.add_grid(
             "/grid",
@@ -100,10 +99,9 @@ class Scene:
     # ---- what is drawn -------------------------------------------------------------------------------------------
 
     def begin(self, s: Snapshot) -> None:
-        """Take the up direction and the camera's shape from a run's first snapshot, and forget the last run."""
+        """Take the up direction from a run's first snapshot, and forget the last run."""
         poses = s.trajectory if s.trajectory_gt is None else s.trajectory_gt
         self.up = up_direction(poses)
-        self.fov_y, self.aspect = s.fov_y_rad, s.aspect
         self._inspected, self._mesh = None, None
         self._lines["trajectory/before the loop"].points = _NO_LINES
         self._server.scene.set_up_direction(tuple(self.up))
@@ -122,7 +120,7 @@ class Scene:
         with self._server.atomic():
             self._lines["trajectory/estimate"].points = polyline(centres)
             truth = _NO_LINES if s.trajectory_gt is None else polyline(s.trajectory_gt[:, :3, 3])
-            if len(truth) != len(self._lines["trajectory/ground truth"].points):
+            if not np.array_equal(truth, self._lines["trajectory/ground truth"].points):
                 self._lines["trajectory/ground truth"].points = truth
             self._draw_keyframes(s)
             self._draw_camera(s)
@@ -215,6 +213,7 @@ class Scene:
             if self._on_keyframe is not None:
                 self._frusta.on_click(self._clicked)
         else:
+            self._frusta.vertices = frustum_corners(s.fov_y_rad, s.aspect, FRUSTUM_M).astype(np.float32)
             self._frusta.batched_wxyzs = wxyz(poses).astype(np.float32)
             self._frusta.batched_positions = poses[:, :3, 3].astype(np.float32)
             self._frusta.batched_colors = colors
@@ -243,6 +242,7 @@ class Scene:
                 receive_shadow=False,
                 jpeg_quality=80,
             )
+        self._camera.fov, self._camera.aspect = s.fov_y_rad, s.aspect
         self._camera.position = pose[:3, 3]
         self._camera.wxyz = wxyz(pose)
         self._camera.image = s.color if self._inspected is None else None

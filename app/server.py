@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import secrets
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 
 from ecslam.runtime.protocol import EngineHandle
 from ecslam.types import InputError
 
-from .front import bind, close_viser, is_loopback, open_viser
+from .front import close_viser, is_loopback, open_viser
 from .hub import Hub
+from .listen import bind
 from .replay import ReplayEngine
 from .runs import load_run
 
@@ -47,11 +49,13 @@ def start(
     port: int = DEFAULT_PORT,
     token: str | None = None,
     dark: bool = False,
+    listener: socket.socket | None = None,
 ) -> Dashboard:
     """Serve the dashboard of ``engine``. Raises InputError for a busy port, an unknown host or a short token.
 
     port 0 takes any free port. A host that other machines can reach always needs a token: without one given a fresh
-    one is made. The token is part of ``Dashboard.url``; the page then keeps it in a cookie.
+    one is made. The token is part of ``Dashboard.url``; the page then keeps it in a cookie. listener: what ``bind`` has
+    given for ``host`` already; ``port`` does not count then.
     """
     if token is not None and (
         len(token) < SHORTEST_TOKEN or not token.isascii() or not token.replace("-", "_").isidentifier()
@@ -59,7 +63,7 @@ def start(
         raise InputError(f"--token: use at least {SHORTEST_TOKEN} letters, digits, '-' or '_', beginning with a letter")
     if token is None and not is_loopback(host):
         token = f"t{secrets.token_urlsafe(24)}"
-    listener = bind(host, port)
+    listener = listener or bind(host, port)
     server = open_viser(listener, host, token, "EC-SLAM")
     hub = Hub(engine, server, dark)
     hub.start()

@@ -53,8 +53,8 @@ STYLE = """
   --button-color:var(--mantine-color-text)!important;border:1px solid var(--mantine-color-default-border)}
 @media (max-width:48em){.mantine-Paper-root[style*="bottom: 0px"]{width:100%!important;max-height:52%!important;
   border-radius:14px 14px 0 0!important}.mantine-Paper-root [style*="width: 20em"]{width:100%!important}}
-.u-legend .u-series:first-child,.u-legend .u-value{display:none!important}
-.u-legend th:after{content:none!important}
+.u-legend{font-size:11.5px!important;text-align:left!important}
+.ec-upright{display:none!important}
 .u-title{font-size:12.5px!important;font-weight:600}
 .ec{font-size:12.5px;line-height:1.45;color:var(--mantine-color-text);padding:4px 8px 6px;
   font-variant-numeric:tabular-nums}
@@ -84,9 +84,9 @@ STYLE = """
 .ec-key i{display:inline-block;width:14px;height:3px;border-radius:2px;margin-right:5px;background:var(--c);
   vertical-align:middle}
 .ec-six{display:grid;grid-template-columns:1fr 1fr;gap:5px}
-.ec-six figure{margin:0;position:relative;border-radius:6px;overflow:hidden;background:#8884;aspect-ratio:4/3}
+.ec-six figure{margin:0;position:relative;border-radius:6px;overflow:hidden;background:#8884}
 .ec-six figure:only-child{grid-column:1/-1}
-.ec-six img{width:100%;height:100%;object-fit:cover;display:block}
+.ec-six img{width:100%;display:block}
 .ec-six figcaption{position:absolute;left:5px;bottom:4px;font-size:10px;padding:0 6px;border-radius:9px;color:#fff;
   background:#0009}
 """

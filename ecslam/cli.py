@@ -79,12 +79,11 @@ def run(
     resolved = resolve_config(preset, opened, config, settings, seed, schedule)
     folder = out or commands.unused(Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}")
     offered = commands.offered(data or [])
-    if not headless:
-        commands.require_port(host, port)
+    listener = None if headless else commands.listen(host, port)
     engine = commands.make_engine(
         resolved, sequence, opened, folder, commands.pick_device(device, resolved), frames, offered
     )
-    commands.start(engine, headless, host, port, not no_browser)
+    commands.start(engine, listener, host, not no_browser)
 
 
 @app.command()
@@ -127,10 +126,9 @@ def resume(
     """Go on with an interrupted run from its last checkpoint."""
     from . import commands
 
-    if not headless:
-        commands.require_port(host, port)
+    listener = None if headless else commands.listen(host, port)
     engine = commands.resume_engine(folder, commands.pick_device(device), sequence)
-    commands.start(engine, headless, host, port, not no_browser)
+    commands.start(engine, listener, host, not no_browser)
 
 
 @app.command()
@@ -289,8 +287,11 @@ def resolve_config(
         resolved = configuration.load_config(file, resolved, sequence.layout)
         if preset not in (None, resolved.preset):
             raise InputError(f"{file}: is for preset {resolved.preset}, not {preset}; leave --preset out, or change it")
-    direct = [f"{k}={v}" for k, v in (("seed", seed), ("schedule", schedule)) if v is not None]
-    return configuration.apply_settings(resolved, [*(settings or []), *direct])
+    resolved = configuration.apply_settings(resolved, settings or [])
+    for key, value in (("seed", seed), ("schedule", schedule)):
+        if value is not None:
+            resolved = configuration.apply(resolved, {key: value}, f"--{key}")
+    return resolved
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import sys
 import tempfile
 import threading
@@ -121,22 +122,23 @@ def resume_engine(folder: Path, device: str, sequence: str | None) -> Engine:
     return Engine.resume(folder, device=device, sequences=BUILT_IN, sequence=moved)
 
 
-def require_port(host: str, port: int) -> None:
-    """Raises InputError when the dashboard could not listen there, before a run folder is touched."""
-    from ecslam_app.front import bind
+def listen(host: str, port: int) -> socket.socket:
+    """The dashboard's socket, before a run folder is touched. Raises InputError when it cannot listen there."""
+    from ecslam_app.listen import bind
 
-    bind(host, port).close()
+    return bind(host, port)
 
 
-def start(engine: Engine, headless: bool, host: str, port: int, browser: bool) -> None:
-    """Run to the end, with or without the dashboard. The engine proper is imported while the first frames are read."""
+def start(engine: Engine, listener: socket.socket | None, host: str, browser: bool) -> None:
+    """Run to the end, under the dashboard where there is a ``listener`` (on ``host``) for it. The engine proper is
+    imported while the first frames are read."""
     importing = threading.Thread(target=import_slam, name="import", daemon=True)
     importing.start()
     try:
-        if headless:
+        if listener is None:
             run_headless(engine)
         else:
-            run_with_dashboard(engine, host, port, browser)
+            run_with_dashboard(engine, listener, host, browser)
     finally:
         importing.join()
 
@@ -178,14 +180,14 @@ def progress_line(s: Snapshot, window: int, wide: bool = True) -> str:
     return "  ".join(figures)
 
 
-def run_with_dashboard(engine: Engine, host: str, port: int, browser: bool) -> None:
+def run_with_dashboard(engine: Engine, listener: socket.socket, host: str, browser: bool) -> None:
     """Run in the background under the dashboard until Ctrl-C; a finished run is reported while the page stays up."""
     from ecslam_app import server
 
     reports = Reports(engine)
     with quit_on_signals(engine):
-        dashboard = server.start(engine, host, port)
-        _announce(dashboard, browser)
+        dashboard = server.start(engine, host, listener=listener)
+        _announce(dashboard, browser, "everything but an unfinished run's mesh is saved first")
         engine.start(reports.watch)
         engine.join()
     dashboard.close()
@@ -199,7 +201,7 @@ def view(folders: list[Path], host: str, port: int, browser: bool) -> None:
     from ecslam_app import server
 
     dashboard = server.view(folders, host, port)
-    _announce(dashboard, browser)
+    _announce(dashboard, browser, "the runs stay as they are")
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
@@ -227,7 +229,8 @@ def bench_viewers(address: str, preset: str, frames: str, viewers: int, pairs: i
 
 
 class Reports:
-    """Reports every run of an engine once, as soon as it is over, on a thread of its own: drawing takes seconds."""
+    """Reports every run of an engine once, as soon as it is over, on a thread of its own: drawing takes seconds. What
+    ended a run that failed is said at once."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -238,6 +241,8 @@ class Reports:
         """Take every snapshot, on the engine's thread."""
         if s.state is State.FINISHED:
             self._report()
+        elif s.state is State.FAILED:
+            console.print(f"error: {s.reason}", soft_wrap=True, markup=False)
 
     def _report(self) -> None:
         folder, summary = self._engine.run_folder, self._engine.summary
@@ -253,7 +258,8 @@ class Reports:
 
 
 def finish_run(folder: Path, summary: dict[str, Any]) -> None:
-    """Draw the picture of the run, print its figures and where they lie. A picture that fails is a warning."""
+    """Draw the picture of the run, print its figures and where they lie, and how to get a mesh that it lacks. A picture
+    that fails is a warning."""
     picture = None
     try:
         picture = draw_picture(folder)
@@ -269,6 +275,9 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     for note in (summary["kernels_note"], *(f"{name} not saved ({why})" for name, why in summary["not_saved"].items())):
         if note:
             console.print(f"  note: {note}", soft_wrap=True, markup=False)
+    if not (folder / "mesh.ply").is_file():
+        text = f"  no mesh.ply yet: ecslam mesh {folder} makes it, or ecslam resume {folder} goes on with the run"
+        console.print(text, soft_wrap=True, markup=False)
 
 
 def draw_picture(folder: Path) -> Path | None:
@@ -351,9 +360,9 @@ def _progress() -> Progress:
     return Progress(*columns, console=console, refresh_per_second=4)
 
 
-def _announce(dashboard: Any, browser: bool) -> None:
+def _announce(dashboard: Any, browser: bool, at_the_end: str) -> None:
     console.print(f"Dashboard: {dashboard.url}", soft_wrap=True)
     console.print(f"From another machine: {dashboard.ssh_hint}, then open the same address there", soft_wrap=True)
-    console.print("Ctrl-C ends it; everything is saved first.")
+    console.print(f"Ctrl-C ends it; {at_the_end}.")
     if browser:
         webbrowser.open(dashboard.url)

@@ -116,8 +116,9 @@ class Snapshot:
 
     trajectory: float64 [n, 4, 4] estimate of frames 0..n-1, in the world of the ground truth where there is one.
     trajectory_gt: float64 [N, 4, 4] (NaN where missing) or None. color: uint8 [h, w, 3] of the current frame, small.
-    fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, else "". map_loss: the
-    objective of the last mapping so far; losses: see ``StepReport``.
+    fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, how far the last mapping
+    is, or what cannot be shown, else "". map_loss: the objective of the last mapping so far; losses: see
+    ``StepReport``.
     """
 
     state: State
@@ -157,11 +158,13 @@ class MeshReady:
 
 @dataclass(frozen=True)
 class Exported:
-    """A file was written. kind: ``mesh``, ``trajectory``, ...; path: where it lies; command_id: who asked for it."""
+    """A file was written. kind: ``mesh``, ``trajectory``, ...; path: where it lies; command_id: who asked for it;
+    error: why there is none, else ""."""
 
     kind: str
     path: str
     command_id: int | None = None
+    error: str = ""
 
 
 @dataclass(frozen=True)
@@ -203,7 +206,10 @@ class RunTo:
 
 @dataclass(frozen=True)
 class Stop:
-    """End the run here as if the sequence ended: save everything, state FINISHED. ``Restart`` begins again."""
+    """End the run here as if the sequence ended: save everything, state FINISHED. ``Restart`` begins again.
+
+    During the last mapping: leave out the rest of it.
+    """
 
 
 @dataclass(frozen=True)

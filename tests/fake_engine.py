@@ -319,7 +319,7 @@ def write_run(folder: Path, frames: int = 60, drift: float = 1.0, truth: bool = 
     mesh = engine._mesh
     trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False).export(folder / "mesh.ply")
     if truth:
-        from ecslam_app.runs import tum_lines
+        from ecslam.evaluation.trajectory_io import format_tum
 
-        (folder / "groundtruth.txt").write_text(tum_lines(np.arange(frames) / 30, engine._gt))
+        (folder / "groundtruth.txt").write_text(format_tum(np.arange(frames) / 30, engine._gt))
     return folder

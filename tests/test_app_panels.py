@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import viser
 from ecslam_app import server
 from ecslam_app.panel import TABS, BasePanel, find_panels
 from ecslam_app.panels.status import WORDS, render
@@ -18,7 +19,7 @@ from ecslam_app.panels.status import Panel as Status
 from ecslam import config as configuration
 from ecslam import messages as m
 from tests.fake_engine import FakeEngine, write_run
-from tests.test_app_security import control, dial, enter, press, until
+from tests.test_app_security import control, dial, enter, hit, press, until
 
 PANELS = find_panels()
 
@@ -40,6 +41,7 @@ def page(engine):
 @pytest.fixture(scope="module")
 def replay_page(tmp_path_factory):
     page = server.view([write_run(tmp_path_factory.mktemp("runs") / "a", 30)], port=0)
+    assert until(lambda: page.hub.current is not None)
     yield page
     page.close()
 
@@ -72,6 +74,46 @@ def test_the_last_window_stays_on_the_page_between_two_mappings(engine, page):
     page.hub._take(replace(mapped, frame=0, window=()))
     assert until(lambda: page.hub.current.frame == 0)
     assert page.hub.current.window == (), "a new run has had no mapping yet"
+
+
+def test_the_plots_of_a_resumed_run_begin_at_its_first_frame(tmp_path):
+    folder = write_run(tmp_path / "run", 30)
+    engine = FakeEngine(folder, frames=60).skip_to(30)
+    page = server.start(engine, port=0)
+    try:
+        assert until(lambda: page.hub.current is engine.latest())
+        assert page.hub.history.series(["ate_cm"])[0].tolist() == list(range(31))
+    finally:
+        page.close()
+
+
+def test_why_there_is_no_mesh_stays_on_the_page(tmp_path):
+    run = write_run(tmp_path / "a", 30)
+    (run / "mesh.ply").write_bytes(b"ply\nnonsense")
+    page = server.view([run], port=0)
+    status = next(p for p in page.hub.panels if isinstance(p, Status))
+    try:
+        assert until(lambda: "mesh.ply: not a readable mesh" in status._html.content)
+        page.engine.submit(m.RunTo(5))
+        assert until(lambda: page.hub.current.frame == 5)
+        assert "mesh.ply: not a readable mesh" in status._html.content
+    finally:
+        page.close()
+
+
+def test_a_second_run_without_a_readable_mesh_says_so(tmp_path, monkeypatch):
+    runs = [write_run(tmp_path / name, 30) for name in "ab"]
+    (runs[1] / "mesh.ply").write_bytes(b"ply\nnonsense")
+    page, told = server.view(runs, port=0), []
+    monkeypatch.setattr(page.hub, "toast", lambda title, text, *rest: told.append(text))
+    try:
+        with dial(page) as client:
+            enter(client)
+            press(page, client, "Mesh of", "b")
+            assert until(lambda: told)
+        assert "mesh.ply: not a readable mesh" in told[0]
+    finally:
+        page.close()
 
 
 def test_a_halt_is_announced_until_it_has_come_about(engine, page):
@@ -108,6 +150,21 @@ def test_a_new_run_hides_what_the_last_one_drew(engine, page):
     assert scene._frusta.visible
 
 
+def test_a_new_run_of_equal_length_brings_its_own_truth_and_camera(engine, page):
+    scene, s = page.hub.scene, engine.skip_to(20).snapshot()
+    assert until(lambda: page.hub.current is engine.latest())
+    scene.update(s)
+    moved = s.trajectory_gt.copy()
+    moved[:, :3, 3] += 1.0
+    truth, corners = scene._lines["trajectory/ground truth"].points.copy(), scene._frusta.vertices.copy()
+    other = replace(s, frame=0, trajectory_gt=moved, fov_y_rad=0.5, aspect=2.0)
+    scene.begin(other)
+    scene.update(other)
+    assert np.allclose(scene._lines["trajectory/ground truth"].points, truth + 1.0, atol=1e-5)
+    assert (scene._camera.fov, scene._camera.aspect) == (0.5, 2.0)
+    assert not np.allclose(scene._frusta.vertices, corners)
+
+
 def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
     engine = FakeEngine(tmp_path / "run", frames=60)
     engine.run_folder.mkdir()
@@ -129,17 +186,92 @@ def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
 def test_the_slider_of_a_replay_follows_wherever_it_goes(replay_page):
     slider = control(replay_page, "Frame")[1]
     replay_page.engine.submit(m.RunTo(11))
-    assert until(lambda: slider.value == 12)
+    assert until(lambda: slider.value == 11)
     replay_page.engine.submit(m.Step())
-    assert until(lambda: slider.value == 13)
+    assert until(lambda: slider.value == 12)
     with dial(replay_page) as client:
         enter(client)
         assert until(lambda: list(replay_page.hub.viewers()))
         press(replay_page, client, "Frame", 20)
-        assert until(lambda: replay_page.hub.current.frame == 19)
+        assert until(lambda: replay_page.hub.current.frame == 20)
         assert slider.value == 20
     replay_page.engine.submit(m.Step())
     assert until(lambda: slider.value == 21)
+
+
+def test_a_replay_announces_nothing_that_it_has_done_already(replay_page):
+    status = Status(replay_page.hub)
+    status.ack(m.Ack(1, m.RunTo(11)))
+    assert "Running on" not in status._html.content
+
+
+def test_the_plots_of_a_replay_mark_the_frame_that_is_shown(replay_page):
+    chart = next(p for p in replay_page.hub.panels if p.tab == "Plots")._error
+    for frame in (4, 23):
+        replay_page.engine.submit(m.RunTo(frame))
+        assert until(lambda frame=frame: replay_page.hub.current.frame == frame)
+        assert until(lambda frame=frame: set(chart._plot.data[0][np.isfinite(chart._plot.data[-1])]) == {frame})
+    frames, values, upright = chart._plot.data
+    assert frames[np.isfinite(values)].tolist() == sorted([*range(30), 23])
+    assert upright[np.isfinite(upright)].tolist() == [0.0, chart._plot.scales["y"]["range"][1]]
+    assert len(chart._plot.series) == 3
+
+
+def test_the_space_key_plays_and_pauses_a_replay(replay_page):
+    replay_page.engine.submit(m.SpeedLimit(1.0))
+    replay_page.engine.submit(m.RunTo(3))
+    with dial(replay_page) as client:
+        enter(client)
+        assert until(lambda: replay_page.hub.current.frame == 3)
+        hit(replay_page, client, "Pause or go on")
+        assert until(lambda: replay_page.hub.current.state is m.State.TRACKING)
+        hit(replay_page, client, "Pause or go on")
+        assert until(lambda: replay_page.hub.current.state is m.State.PAUSED)
+        before = replay_page.hub.current.frame
+        hit(replay_page, client, "Step one frame")
+        assert until(lambda: replay_page.hub.current.frame == before + 1)
+
+
+def test_the_space_key_pauses_a_run_and_lets_it_go_on(page, engine):
+    engine.start()
+    with dial(page) as client:
+        enter(client)
+        assert until(lambda: page.hub.current is not None)
+        hit(page, client, "Pause or go on")
+        assert until(lambda: page.hub.current.state is m.State.PAUSED)
+        hit(page, client, "Pause or go on")
+        assert until(lambda: m.Resume() in engine.log)
+
+
+@pytest.mark.parametrize("end", [m.State.FINISHED, m.State.FAILED])
+def test_a_run_that_is_over_offers_no_steering_until_a_restart(engine, page, end):
+    def usable():
+        labels = ("Frame", "Run to frame", "Go on with this preset", "Mapping iterations", "Tracking iterations")
+        return {control(page, "Run")[1].visible, *(not control(page, label)[1].disabled for label in labels)}
+
+    s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)
+    assert until(lambda: page.hub.current is engine.latest())
+    for shown, wanted in ((s, True), (replace(s, frame=10, state=end), False), (replace(s, frame=0), True)):
+        page.hub._take(shown)
+        assert until(lambda shown=shown: page.hub.current.state is shown.state)
+        assert until(lambda wanted=wanted: usable() == {wanted})
+    assert not control(page, "Restart")[1].disabled
+
+
+def test_an_export_that_fails_is_no_longer_under_way(page, engine, monkeypatch):
+    told = []
+    monkeypatch.setattr(page.hub, "toast", lambda title, text, color, client=None: told.append((title, text)))
+    monkeypatch.setattr(engine, "_carry_out", lambda number, command: None)
+    engine.start()
+    with dial(page) as client:
+        enter(client)
+        assert until(lambda: list(page.hub.viewers()))
+        press(page, client, "Export keyframes", True)
+        assert until(lambda: page.hub._under_way)
+        (number,) = page.hub._under_way
+        engine._feed.publish(m.Exported("keyframes", "", number, "No space left on device"))
+        assert until(lambda: ("Not exported", "keyframes: No space left on device") in told)
+        assert page.hub._under_way == {}
 
 
 def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, page):
@@ -162,7 +294,7 @@ def test_a_replay_shows_the_pictures_that_its_run_kept(replay_page, engine):
     panel = next(p for p in replay_page.hub.panels if p.tab == "Pictures")
     assert "kept no pictures" in panel._html.content
     panel.snapshot(engine.skip_to(12).snapshot())
-    assert "Keyframe 11" in panel._html.content
+    assert "Keyframe 10" in panel._html.content
     assert "data:image/jpeg" in panel._html.content
 
 
@@ -217,7 +349,8 @@ def test_state_is_told_in_plain_words(engine, state):
     html = render(replace(engine.snapshot(), state=state, reason="why <b>"), "")
     assert WORDS[state] in html
     assert "why &lt;b&gt;" in html
-    assert "Frame <b>1</b> of 60" in html
+    assert "Frame <b>0</b></span>" in html
+    assert "1 of 60" in html
 
 
 def test_controls_answer_at_once_while_the_page_is_busy(page, engine):
@@ -252,6 +385,21 @@ def test_each_control_sends_its_command(page, engine, label, value, command):
         enter(client)
         press(page, client, label, value)
         assert until(lambda: command in engine.log)
+
+
+def test_the_mesh_mode_in_force_is_marked(replay_page):
+    with dial(replay_page) as client:
+        enter(client)
+        press(replay_page, client, "Mesh", "Wireframe")
+        assert until(lambda: replay_page.hub.scene._mode == "Wireframe")
+    mode = control(replay_page, "Mesh")[1]
+    assert isinstance(mode, viser.GuiDropdownHandle), "unlike a group of buttons, it shows its value"
+    assert mode.value == "Wireframe"
+
+
+def test_the_voxel_size_of_a_mesh_is_asked_for_only_where_one_is_made(page, replay_page):
+    assert control(page, "Voxel size (cm)")[1].visible
+    assert not control(replay_page, "Voxel size (cm)")[1].visible
 
 
 def test_live_only_controls_are_absent_from_a_replay(replay_page):

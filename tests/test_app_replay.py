@@ -10,14 +10,15 @@ import zipfile
 import numpy as np
 import pytest
 import trimesh
-from ecslam_app import server
+from ecslam_app import server, theme
 from ecslam_app.geometry import best_side, overview, rotation_difference_deg, rotation_to, up_direction
 from ecslam_app.glb import simplify, to_glb, vertex_normals
 from ecslam_app.history import History
+from ecslam_app.panels.compare import figures_table
 from ecslam_app.past import Past
 from ecslam_app.record import html_replay
 from ecslam_app.replay import ReplayEngine
-from ecslam_app.runs import kitti_lines, load_mesh, load_run, tum_lines
+from ecslam_app.runs import load_run
 
 from ecslam import messages as m
 from ecslam.runtime.protocol import EngineHandle
@@ -75,6 +76,27 @@ def test_scrubbing_shows_what_was_there_at_that_frame(replay, frame):
     assert all(k.frame <= at for k in s.keyframes)
     assert all(e.frame <= at for e in s.loops)
     assert set(s.window) <= {k.frame for k in s.keyframes}
+
+
+def test_a_run_with_skipped_frames_is_shown_by_frame_number(folder, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_text("".join(lines[:11] + lines[14:]))  # without the frames 11, 12 and 13
+    whole, engine = load_run(folder), ReplayEngine(load_run(run))
+    try:
+        assert engine.latest().frame == FRAMES - 1
+        assert engine.latest().frames_total == FRAMES
+        for frame, seen in ((12, 10), (14, 14), (36, 36)):
+            events(engine, m.Snapshot, m.RunTo(frame))
+            s = engine.latest()
+            assert (s.frame, len(s.trajectory)) == (frame, frame + 1)
+            assert np.allclose(s.trajectory[-1], whole.trajectory[seen])
+            assert np.allclose(s.trajectory_gt[frame], whole.trajectory_gt[seen])
+            assert [k.frame for k in s.keyframes] == list(range(0, frame + 1, 5))
+            assert len(s.loops) == (frame >= 36)
+    finally:
+        engine.close()
 
 
 def test_past_poses_are_those_of_the_frame(folder):
@@ -141,12 +163,23 @@ def test_exports(replay, folder):
     mesh = trimesh.load_mesh(events(replay, m.Exported, m.Export("mesh", "ply"))[0].path, process=False)
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
     tum = np.loadtxt(events(replay, m.Exported, m.Export("trajectory", "tum"))[0].path)
-    assert np.allclose(tum[:, 1:4], load_run(folder).trajectory[:, :3, 3], atol=1e-6)
+    assert np.array_equal(tum[:, 1:4], load_run(folder).trajectory[:, :3, 3]), "not a digit is lost"
     kitti = np.loadtxt(events(replay, m.Exported, m.Export("trajectory", "kitti"))[0].path)
-    assert np.allclose(kitti.reshape(-1, 3, 4), load_run(folder).trajectory[:, :3])
+    assert np.array_equal(kitti.reshape(-1, 3, 4), load_run(folder).trajectory[:, :3])
+    keyframes = np.loadtxt(events(replay, m.Exported, m.Export("keyframes"))[0].path)
+    assert np.array_equal(keyframes, tum[::5])
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "000039.safetensors").write_bytes(b"large")
     with zipfile.ZipFile(events(replay, m.Exported, m.Export("run", "zip"))[0].path) as archive:
-        assert {"metrics.jsonl", "mesh.ply", "summary.json"} <= set(archive.namelist())
-        assert not any(name.startswith("exports") for name in archive.namelist())
+        assert {f"lite/{name}" for name in ("metrics.jsonl", "mesh.ply", "summary.json")} <= set(archive.namelist())
+        assert not any(name.startswith(("lite/exports", "lite/checkpoints")) for name in archive.namelist())
+
+
+def test_a_comparison_says_which_path_is_whose(folder):
+    run = load_run(folder)
+    html = figures_table(run, run, ("First", "Second"))
+    for name, color in (("First", theme.ESTIMATE), ("Second", theme.OTHER)):
+        assert f'<i style="--c:{theme.css(color)}"></i>path of {name}' in html
 
 
 def test_killed_run_with_a_cut_line_opens(folder, tmp_path):
@@ -182,13 +215,6 @@ def test_html_replay_is_one_file_without_addresses_of_others(replay, tmp_path):
     page = html_replay(replay.latest(), room_mesh(0.3), replay.history, dark=False)
     assert "__VISER_EMBED_DATA__" in page
     assert "http://localhost" not in page
-
-
-def test_tum_lines_leave_out_what_is_missing():
-    poses = walk(4)
-    poses[2] = np.nan
-    assert len(tum_lines(np.arange(4), poses).splitlines()) == 3
-    assert len(kitti_lines(walk(4)).splitlines()) == 4
 
 
 # ---- what is drawn ------------------------------------------------------------------------------------------------
@@ -281,9 +307,3 @@ def test_history_thins_and_fills_gaps():
     assert len(frames) <= 101
     assert np.isnan(ate[frames % 2 == 0]).all()
     assert history.window_at(57) == (50,)
-
-
-def test_load_mesh_refuses_what_is_none(tmp_path):
-    (tmp_path / "mesh.ply").write_text("ply\nnonsense")
-    with pytest.raises(InputError, match="mesh"):
-        load_mesh(tmp_path / "mesh.ply")

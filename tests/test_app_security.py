@@ -10,6 +10,7 @@ import msgspec
 import pytest
 import viser
 from ecslam_app import front, guard, server
+from ecslam_app.listen import bind
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -93,6 +94,12 @@ def until(condition, seconds=5.0):
 
 def press(page, client, label, value):
     say(client, "GuiUpdateMessage", uuid=control(page, label)[0], updates={"value": value})
+
+
+def hit(page, client, label):
+    """The hot key of this command, or its line in the palette."""
+    commands = page.hub.server.gui._command_handle_from_uuid
+    say(client, "CommandTriggerMessage", uuid=next(u for u, c in commands.items() if c.label == label))
 
 
 def alive(page, client, engine):
@@ -279,4 +286,4 @@ def test_a_viser_that_cannot_be_guarded_is_not_used(monkeypatch):
         front._Shell, "serve", lambda self, serve, handler, host, port, **rest: serve(handler, "127.0.0.1", 0, **rest)
     )
     with pytest.raises(RuntimeError, match="cannot be guarded"):
-        front.open_viser(front.bind("127.0.0.1", 0), "127.0.0.1", None, "x")
+        front.open_viser(bind("127.0.0.1", 0), "127.0.0.1", None, "x")

@@ -59,6 +59,10 @@ class Visit:
     def press(self, name):
         self.page.get_by_role("button", name=name, exact=True).click()
 
+    def choose(self, label, option):
+        self.page.get_by_label(label, exact=True).first.click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
     def tab(self, name):
         self.page.get_by_role("tab", name=name).click()
 
@@ -120,7 +124,7 @@ def test_scene_shows_mesh_trajectories_and_frusta(live):
     _, visit = live
     visit.tab("View")
     full = visit.pixels()
-    visit.press("Off")
+    visit.choose("Mesh", "Off")
     visit.wait(lambda: (np.abs(full - visit.pixels()).max(-1) > 25).mean() > 0.1)  # the mesh covers much of the view
     bare = visit.pixels()
     assert hue_count(bare, 25) > 300, "the estimate is orange"
@@ -130,7 +134,7 @@ def test_scene_shows_mesh_trajectories_and_frusta(live):
     visit.wait(lambda: hue_count(visit.pixels(), 217) < 0.2 * hue_count(bare, 217))
     visit.tick("Keyframes")
     visit.wait(lambda: hue_count(visit.pixels(), 292) < 0.5 * hue_count(bare, 292))
-    visit.press("Wireframe")
+    visit.choose("Mesh", "Wireframe")
     visit.wait(lambda: (np.abs(visit.pixels() - bare).max(-1) > 25).mean() > 0.02)
 
 
@@ -159,8 +163,7 @@ def test_pause_step_resume_and_hot_keys(live):
 
 def test_switch_preset_and_start_over(live):
     engine, visit = live
-    visit.page.get_by_label("Preset", exact=True).first.click()
-    visit.page.get_by_role("option", name="full", exact=True).click()
+    visit.choose("Preset", "full")
     visit.press("Restart")
     visit.wait(lambda: m.Restart("synthetic/studio", "full", 0, "strict") in engine.log)
     visit.page.locator(".ec-name", has_text="full").wait_for()
@@ -176,7 +179,7 @@ def test_exports_arrive_in_the_browser(live, tmp_path):
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
     visit.page.get_by_text(str(engine.run_folder)).first.wait_for()
     visit.download("Export trajectory").save_as(tmp_path / "poses.txt")
-    assert len((tmp_path / "poses.txt").read_text().splitlines()) == visit.frame
+    assert len((tmp_path / "poses.txt").read_text().splitlines()) == visit.frame + 1
     visit.download("Save screenshot").save_as(tmp_path / "shot.png")
     assert np.asarray(Image.open(tmp_path / "shot.png")).std() > 10
     assert list((engine.run_folder / "exports").glob("screenshot_*.png"))
@@ -230,15 +233,15 @@ def test_finished_run_is_scrubbed_and_its_loop_inspected(browser, tmp_path):
     dashboard = server.view([write_run(tmp_path / "lite", 60), write_run(tmp_path / "full", 60, drift=0.3)], port=0)
     visit = Visit(browser, dashboard)
     try:
-        assert visit.frame == 60
+        assert visit.frame == 59
         assert visit.page.get_by_text("ATE RMSE, cm").count() == 1
         slider = visit.page.get_by_role("slider").first
         slider.focus()
         for _ in range(12):
             visit.page.keyboard.press("ArrowLeft")
-        visit.wait(lambda: visit.frame == 48)
+        visit.wait(lambda: visit.frame == 47)
         visit.press("Play")
-        visit.wait(lambda: visit.frame == 60)
+        visit.wait(lambda: visit.frame == 59)
         before = visit.camera
         visit.tab("Loops")
         visit.press("Next event")
@@ -246,6 +249,10 @@ def test_finished_run_is_scrubbed_and_its_loop_inspected(browser, tmp_path):
         visit.page.wait_for_timeout(1500)
         assert np.linalg.norm(visit.camera - before) > 0.3
         assert hue_count(visit.pixels(), 160) > 20, "the links are green"
+        visit.tab("Plots")
+        visit.page.locator(".u-over:visible").first.hover()
+        shown = visit.page.locator(".u-legend:visible .u-value:visible")
+        visit.wait(lambda: [float(text) > 0 for text in shown.all_inner_texts()[:2] if text != "--"] == [True, True])
     finally:
         visit.page.close()
         dashboard.close()
@@ -295,10 +302,10 @@ def test_the_engine_proper_is_watched_paused_stepped_and_taken_away(browser, tmp
         visit.wait(lambda: visit.frame == before + 1)
         visit.state("Paused")
         visit.tab("View")
-        visit.press("Off")
+        visit.choose("Mesh", "Off")
         visit.wait(lambda: not dashboard.hub.scene._mesh_handle.visible)
         bare = visit.pixels()
-        visit.press("Colour")
+        visit.choose("Mesh", "Colour")
         visit.wait(lambda: (np.abs(visit.pixels() - bare).max(-1) > 25).mean() > 0.03)
         visit.tab("Export")
         visit.download("Export mesh").save_as(tmp_path / "mesh.ply")
@@ -306,7 +313,7 @@ def test_the_engine_proper_is_watched_paused_stepped_and_taken_away(browser, tmp
         assert len(mesh.faces) > 1000
         assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 100
         visit.download("Export trajectory").save_as(tmp_path / "poses.txt")
-        assert len((tmp_path / "poses.txt").read_text().splitlines()) == before + 1 == visit.frame
+        assert len((tmp_path / "poses.txt").read_text().splitlines()) == before + 2 == visit.frame + 1
     finally:
         visit.page.close()
         engine.submit(m.Quit())

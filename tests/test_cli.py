@@ -262,7 +262,7 @@ def test_a_missing_depth_image(sequence, tmp_path):
         (["--set", "mapping.rays=1"], ["mapping.rays", "out of range"]),
         (["--preset", "ful"], ["'ful'", "did you mean 'full'"]),
         (["--config", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
-        (["--schedule", "loose"], ["schedule", "strict", "overlap"]),
+        (["--schedule", "loose"], ["error: --schedule", "strict", "overlap"]),
         (["--frames", "8"], ["--frames 8", "A:B"]),
         (["--frames", "90:99"], ["selects nothing", "0 .. 7"]),
         (["--frames", "5:0:-1"], ["--frames 5:0:-1", "STEP"]),

@@ -131,10 +131,11 @@ def test_datasets_import_the_ground_layer_only():
             assert layers <= GROUND | {"datasets"}, module
 
 
-def test_the_dashboard_imports_the_contracts_only():
+def test_the_dashboard_imports_contracts_and_file_formats_only():
     for module in MODULES:
         if module.startswith("ecslam_app"):
             found = {name for name in imports(module) if name.split(".")[0] == "ecslam"}
+            found -= {"ecslam.datasets.meshes", "ecslam.evaluation.trajectory_io"}
             assert {ours(name) for name in found} <= {"messages", "config", "types", "runtime"}, module
 
 
@@ -149,6 +150,11 @@ def test_torch_is_not_imported_for(module):
 @pytest.mark.parametrize("library", ["viser", "trimesh"])
 def test_a_headless_engine_starts_without(library):
     assert library not in reached("ecslam.commands") | reached("ecslam.runtime.engine") | reached("ecslam.slam")
+
+
+def test_a_port_is_found_busy_without_viser():
+    assert "viser" not in reached("ecslam_app.listen")
+    assert "viser" in reached("ecslam_app.server")
 
 
 def test_heavy_libraries_stay_behind_their_seams():

@@ -1,6 +1,7 @@
 """Every command does what it says; all are acknowledged at once, also in the middle of a long mapping."""
 
 import json
+import re
 import threading
 import time
 import zipfile
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from fake_slam import Behaviour, FakeSequence
+from fake_slam import QUICK, Behaviour, FakeSequence
 from runtime_watch import Watch, running
 
 from ecslam import config as configuration
@@ -54,10 +55,10 @@ def test_step_and_run_to_process_exactly_the_frames_asked_for(tmp_path):
             snapshot = watch.go(Step(), State.PAUSED)
             assert (snapshot.frame, len(snapshot.trajectory)) == (done - 1, done)
         assert len(watch.go(RunTo(9), State.PAUSED).trajectory) == 10
-        assert watch.ask(RunTo(3)).error == "cannot run to frame 4; 11 .. 30 lie ahead"
+        assert watch.ask(RunTo(3)).error == "cannot run to frame 3; 10 .. 29 lie ahead"
         assert "lie ahead" in watch.ask(RunTo(30)).error
         assert len(watch.go(Resume(), State.FINISHED).trajectory) == 30
-        for command in (Pause(), Resume(), Step(), RunTo(3), Stop()):
+        for command in (Pause(), Resume(), Step(), RunTo(3)):
             assert watch.ask(command).error == "the run is over; restart it"
 
 
@@ -125,6 +126,20 @@ def test_leaving_abandons_the_last_mapping_which_can_be_made_up_for(tmp_path, co
     left = load_checkpoint(tmp_path / "r/checkpoints")
     assert not left.meta["finished"]
     assert not left.arrays["half_way"]
+
+
+def test_the_last_mapping_says_how_far_it_is_and_a_second_stop_leaves_out_the_rest(tmp_path):
+    behaviour = Behaviour(final_interrupts=100_000, pause_s=0.001)
+    with running(tmp_path, FakeSequence(9), behaviour, paused_at=3) as (_, watch, made):
+        assert watch.ask(Stop()).error == ""
+        told = watch.until(lambda m: isinstance(m, Snapshot) and m.reason).reason
+        total = QUICK.mapping.iterations + QUICK.mapping.final_iterations
+        assert re.fullmatch(rf"Last mapping \d+/{total}; Stop leaves out the rest", told)
+        last = watch.go(Stop(), State.FINISHED)
+        assert (len(last.trajectory), last.reason) == (3, "")
+        assert not made[0].finished
+        assert (tmp_path / "mesh.ply").stat().st_size > 1000
+        assert watch.ask(Stop()).error == "", "it has been done already"
 
 
 def test_a_mesh_comes_within_five_seconds_even_during_the_first_mapping(tmp_path):
@@ -201,7 +216,9 @@ def test_tune_and_load_preset_reach_the_engine(tmp_path):
         exported = yaml.safe_load(Path(watch.event(Exported).path).read_text())
         assert exported["tracking"]["rays"] == 2000
     log = (tmp_path / "events.jsonl").read_text()
-    assert "mapping.iterations = 40 from frame 4 on" in log
+    assert "mapping.iterations = 40 from frame 3 on" in log
+    assert "preset full from frame 4 on" in log
+    assert configuration.load_config(tmp_path / "config.yaml") == made[0].config
 
 
 @pytest.mark.parametrize("command", [LoadPreset("live"), Tune("tracking.iterations", 0)])
@@ -358,6 +375,21 @@ def test_exports_are_files_that_other_programs_read(tmp_path):
             assert not [n for n in names if "checkpoints" in n or "exports" in n]
         assert "there are: mesh (ply, glb, obj)" in watch.ask(Export("mesh", "../x")).error
         assert "cannot export" in watch.ask(Export("passwords")).error
+
+
+def test_an_export_that_fails_says_so_to_who_asked_for_it(tmp_path):
+    with running(tmp_path, paused_at=0) as (_, watch, __):
+
+        def failure(*args) -> str:
+            number = watch.ask(Export(*args)).command_id
+            told = watch.until(lambda m: isinstance(m, Exported) and m.command_id == number)
+            assert told.path == ""
+            return told.error
+
+        assert "no map yet" in failure("mesh", "ply")
+        (tmp_path / "exports").write_text("in the way")
+        assert "exists" in failure("trajectory", "tum")
+        assert "exists" in failure("run", "zip")
 
 
 def test_a_finished_run_still_exports_and_quits(tmp_path):

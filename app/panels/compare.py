@@ -5,6 +5,7 @@ from __future__ import annotations
 from html import escape
 
 from ecslam.messages import Event, MeshReady, RequestMesh, Snapshot
+from ecslam.types import InputError
 
 from .. import theme
 from ..hub import Hub
@@ -43,34 +44,36 @@ class Panel(BasePanel):
         super().__init__(hub)
         assert hub.replay is not None
         gui, self._run, self._other = hub.server.gui, hub.replay.run, hub.replay.others[0]
-        gui.add_html(figures_table(self._run, self._other))
         self._shown = (self._run.name, self._other.name) if self._run.name != self._other.name else ("First", "Second")
-        self._mesh_of = gui.add_button_group("Mesh of", self._shown)
+        gui.add_html(figures_table(self._run, self._other, self._shown))
+        self._mesh_of = gui.add_dropdown("Mesh of", self._shown)
         self._past = Past(self._other.rows, self._other.trajectory)
         hub.on(self._mesh_of, lambda event: hub.submit(RequestMesh(0.0)))
 
     def snapshot(self, s: Snapshot) -> None:
-        self.hub.scene.compare(self._past.trajectory(min(s.frame, len(self._other.rows) - 1))[:, :3, 3])
+        self.hub.scene.compare(self._past.trajectory(self._other.row_at(s.frame))[:, :3, 3])
 
     def event(self, event: Event) -> None:
         """A mesh of the first run has come; show the second one's of that frame instead where it is wanted."""
         path = self._other.mesh_at(event.frame) if isinstance(event, MeshReady) else None
-        if path is not None and self._mesh_of.value == self._shown[1]:
+        if path is None or self._mesh_of.value != self._shown[1]:
+            return
+        try:
             self.hub.scene.show_mesh(drawable_mesh(path))
+        except InputError as error:
+            self.hub.toast("No mesh", str(error), "red")
 
 
-def figures_table(a: Run, b: Run) -> str:
-    """The figures that at least one of two runs has, as an HTML table."""
+def figures_table(a: Run, b: Run, names: tuple[str, str]) -> str:
+    """The figures that at least one of two runs has, as an HTML table, and which path is whose."""
     rows = "".join(
         f"<tr><td>{label}</td><td>{_text(a, key, digits)}</td><td>{_text(b, key, digits)}</td></tr>"
         for key, label, digits in _FIGURES
         if a.summary.get(key) is not None or b.summary.get(key) is not None
     )
-    heads = ((a.name, theme.ESTIMATE), (b.name, theme.OTHER))
-    names = "<th></th>" + "".join(
-        f'<th style="border-bottom:3px solid {theme.css(color)}">{escape(name)}</th>' for name, color in heads
-    )
-    return f'<div class="ec"><table><tr>{names}</tr>{rows}</table></div>'
+    heads = "<th></th>" + "".join(f"<th>{escape(name)}</th>" for name in names)
+    paths = theme.legend([(f"path of {names[0]}", theme.ESTIMATE), (f"path of {names[1]}", theme.OTHER)])
+    return theme.card(f"<table><tr>{heads}</tr>{rows}</table>{paths}")
 
 
 def _text(run: Run, key: str, digits: int | None) -> str:

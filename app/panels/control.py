@@ -1,4 +1,4 @@
-"""Steering a live run: pause, resume, step, run to, stop, start over, live parameters; hot keys space and n."""
+"""Steering a live run: pause, resume, step, run to, stop, start over, live parameters."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from ..hub import Hub
 from ..panel import BasePanel, put
 
 SCHEDULES = ("strict", "overlap")
+OVER = (State.FINISHED, State.FAILED)
 _VERBS: dict[str, Command] = {"Pause": Pause(), "Resume": Resume(), "Step": Step(), "Stop": Stop()}
 
 
@@ -42,38 +43,31 @@ class Panel(BasePanel):
         super().__init__(hub)
         self._shown_preset = ""
         gui = hub.server.gui
-        verbs = gui.add_button_group("Run", tuple(_VERBS), hint="Space pauses and resumes, n goes one step")
-        hub.commands(verbs, lambda: _VERBS[verbs.value])
+        self._verbs = gui.add_button_group("Run", tuple(_VERBS), hint="Space pauses and resumes, n goes one step")
+        hub.commands(self._verbs, lambda: _VERBS[self._verbs.value])
         self._until = gui.add_number(
-            "Frame", 1, min=1, max=1_000_000, step=1, hint="Go on until this frame, then pause"
+            "Frame", 0, min=0, max=1_000_000, step=1, hint="Go on until this frame is done, then pause"
         )
-        hub.commands(gui.add_button("Run to frame", color="gray"), lambda: RunTo(int(self._until.value) - 1))
+        self._run_to = gui.add_button("Run to frame", color="gray")
+        hub.commands(self._run_to, lambda: RunTo(int(self._until.value)))
         self._limit = gui.add_slider("Speed limit", 0, 60, 1, 0, hint="Frames per second at most; 0 lifts the limit")
         hub.on(self._limit, lambda event: hub.submit(SpeedLimit(float(self._limit.value)), event.client))
-        self._hot_keys()
         self._start_over()
         self._live_parameters()
 
     def snapshot(self, s: Snapshot) -> None:
-        if int(self._until.max or 0) != s.frames_total:
-            self._until.max = s.frames_total
-            put(self._until, max(1, s.frames_total // 2))
+        if self._until.max != s.frames_total - 1:
+            self._until.max = s.frames_total - 1
+            put(self._until, s.frames_total // 2)
         if s.preset != self._shown_preset:
             self._show_preset(s.preset)
+        self._offer(s.state not in OVER)
 
-    def _hot_keys(self) -> None:
-        gui = self.hub.server.gui
-        toggle = gui.add_command("Pause or resume", hotkey="space", description="Stop after this frame, or go on")
-        step = gui.add_command("Step one frame", hotkey="N", description="Process one frame, then pause")
-
-        @toggle.on_trigger
-        async def _(event: Any) -> None:
-            paused = self.hub.current is not None and self.hub.current.state == State.PAUSED
-            self.hub.submit(Resume() if paused else Pause(), event.client)
-
-        @step.on_trigger
-        async def _(event: Any) -> None:
-            self.hub.submit(Step(), event.client)
+    def _offer(self, steering: bool) -> None:
+        """Show what steers a run as usable or not; viser cannot disable a group of buttons, so that one goes."""
+        self._verbs.visible = steering
+        for control in (self._until, self._run_to, self._go_on, *self._iterations.values()):
+            control.disabled = not steering
 
     def _start_over(self) -> None:
         gui, engine = self.hub.server.gui, self.hub.engine
@@ -93,12 +87,10 @@ class Panel(BasePanel):
                 hint="strict: repeatable; overlap: mapping in parallel",
             )
             self.hub.commands(gui.add_button("Restart", color="orange"), self._restart)
-            self.hub.commands(
-                gui.add_button(
-                    "Go on with this preset", color="gray", hint="Its tracking and mapping settings from here"
-                ),
-                lambda: LoadPreset(self._preset.value),
+            self._go_on = gui.add_button(
+                "Go on with this preset", color="gray", hint="Its tracking and mapping settings from here"
             )
+            self.hub.commands(self._go_on, lambda: LoadPreset(self._preset.value))
 
     def _restart(self) -> Restart:
         return Restart(self._sequence.value, self._preset.value, int(self._seed.value), self._schedule.value)

@@ -18,7 +18,7 @@ SCREENSHOT_TIMEOUT_S = 30.0
 
 
 class Panel(BasePanel):
-    """Every file also stays in the run folder; the toast says where."""
+    """Every file also stays in the run folder; the toast says where. A finished run's mesh has the voxels it has."""
 
     tab, order = "Export", 10
 
@@ -27,7 +27,7 @@ class Panel(BasePanel):
         gui = hub.server.gui
         with gui.add_folder("Mesh"):
             mesh = gui.add_dropdown("Format", ("PLY", "GLB", "OBJ"))
-            voxel = gui.add_slider("Voxel size (cm)", 1.0, 10.0, 0.5, 2.0)
+            voxel = gui.add_slider("Voxel size (cm)", 1.0, 10.0, 0.5, 2.0, visible=hub.replay is None)
             hub.commands(
                 gui.add_button("Export mesh", icon=viser.Icon.DOWNLOAD),
                 lambda: Export("mesh", mesh.value.lower(), voxel.value / 100),
@@ -74,7 +74,7 @@ class Panel(BasePanel):
     def _path(self, name: str) -> Path:
         folder = self.hub.engine.run_folder / "exports"
         folder.mkdir(parents=True, exist_ok=True)
-        frame = 0 if self.hub.current is None else self.hub.current.frame + 1
+        frame = 0 if self.hub.current is None else self.hub.current.frame
         return folder / name.format(frame=frame)
 
     def _screenshot(self, client: Any) -> Path:

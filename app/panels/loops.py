@@ -27,7 +27,7 @@ class Panel(BasePanel):
         super().__init__(hub)
         gui = hub.server.gui
         self._events: tuple[LoopEvent, ...] = ()
-        self._chart = Chart(hub, "Rotation error (°)", legend=False, markers=True)
+        self._chart = Chart(hub, "Rotation error (°)", markers=True)
         self._choice = gui.add_dropdown("Loop event", (NONE,), initial_value=NONE)
         hub.on(self._choice, lambda event: self._inspect(event.client))
         steps = gui.add_button_group("Go to", ("Previous event", "Next event"))
@@ -48,7 +48,7 @@ class Panel(BasePanel):
         for event in s.loops:
             at = int(np.argmin(np.abs(frames - event.frame)))
             marks[at] = np.nan_to_num(values[at])
-        self._chart.show([title, "loop closed"], (frames, values, marks))
+        self._chart.show([title, "loop closed"], (frames, values, marks), s.frame)
 
     def _move(self, step: int, client: Any) -> None:
         if self._events:
@@ -71,7 +71,7 @@ class Panel(BasePanel):
 
 
 def _name(event: LoopEvent) -> str:
-    return f"Frame {event.frame + 1}: {event.correction_cm:.2f} cm"
+    return f"Frame {event.frame}: {event.correction_cm:.2f} cm"
 
 
 def _intro() -> str:
@@ -88,9 +88,9 @@ def _figures(e: LoopEvent) -> str:
         ("Rotation error, °", theme.number(e.rotation_error_before_deg), theme.number(e.rotation_error_after_deg)),
     ]
     body = "".join(f"<tr><td>{name}</td><td>{before}</td><td><b>{after}</b></td></tr>" for name, before, after in rows)
-    old = f"keyframe{'s' * (len(e.keyframes) > 1)} {', '.join(str(k + 1) for k in e.keyframes)}"
+    old = f"keyframe{'s' * (len(e.keyframes) > 1)} {', '.join(map(str, e.keyframes))}"
     return (
-        f'<div class="ec"><b>Frame {e.frame + 1} met {old}</b><br>The pose moved by '
+        f'<div class="ec"><b>Frame {e.frame} met {old}</b><br>The pose moved by '
         f"<b>{e.correction_cm:.2f} cm</b> and <b>{e.correction_deg:.2f}°</b>."
         f"<table><tr><th></th><th>before</th><th>after</th></tr>{body}</table></div>"
     )

@@ -55,16 +55,14 @@ class Panel(BasePanel):
             if self._waiting:
                 self._pause_s, self._waiting = max(EVERY_S, (time.monotonic() - self._asked) / SHARE), False
             figures = "".join(_figure(getattr(event, field), name) for field, name in _ORDER)
-            title = f"Keyframe {event.frame + 1}" if self._keyframe else f"Frame {event.frame + 1}"
+            title = f"Keyframe {event.frame}" if self._keyframe else f"Frame {event.frame}"
             self._html.content = f'<div class="ec"><b>{title}</b><div class="ec-six">{figures}</div></div>'
 
     def keyframe(self, keyframe: KeyframeView) -> None:
         self._keyframe = True
         jpeg = keyframe.jpeg()
         figure = _image(jpeg, "colour") if jpeg else ""
-        self._html.content = (
-            f'<div class="ec"><b>Keyframe {keyframe.frame + 1}</b><div class="ec-six">{figure}</div></div>'
-        )
+        self._html.content = f'<div class="ec"><b>Keyframe {keyframe.frame}</b><div class="ec-six">{figure}</div></div>'
         if self.hub.replay is None:
             self.hub.submit(RequestPictures(keyframe.frame))
 

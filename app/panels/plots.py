@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,34 +16,43 @@ from ..hub import Hub
 from ..panel import BasePanel
 
 EVERY_S = 0.5
-HEIGHT = 150
+HEIGHT, NEAR_PX = 150, 10
 _RESIDUAL = "_mm"  # ends the names of what is measured in millimetres and therefore no loss
 _PALETTE = (theme.ESTIMATE, theme.TRUTH, theme.WINDOW, theme.LOOP, (234, 179, 8), theme.BEFORE, theme.KEYFRAME)
+# Its class keeps it out of the legend and without a point under the mouse.
+_UPRIGHT = cast(
+    uplot.Series, {"label": "shown", "class": "ec-upright", "stroke": theme.css(theme.KEYFRAME), "width": 1.2}
+)
 
 
 class Chart:
-    """One uPlot chart whose series can grow in number."""
+    """One uPlot chart whose series can grow in number; below it, the values under the mouse.
 
-    def __init__(self, hub: Hub, title: str, legend: bool = True, markers: bool = False, peaks: bool = True) -> None:
+    Over a replay an upright line marks the frame that is shown.
+    """
+
+    def __init__(self, hub: Hub, title: str, markers: bool = False, peaks: bool = True) -> None:
         """markers: the last series is points only. peaks: rare high values stay within the range.
 
         A chart is out of sight until it has something to show.
         """
         self._gui, self._names, self._markers, self._peaks = hub.server.gui, [""], markers, peaks
+        self._upright = (_UPRIGHT,) if hub.replay is not None else ()
         self._plot = self._gui.add_uplot(
             (np.array([0.0, 1.0]), np.array([np.nan, np.nan])),
             (uplot.Series(label="frame"), uplot.Series(label=title)),
             title=title,
             height=HEIGHT,
             axes=_axes(),
-            legend=uplot.Legend(show=legend),
-            cursor=uplot.Cursor(drag=uplot.Cursor_Drag(x=False, y=False)),
+            cursor=uplot.Cursor(
+                drag=uplot.Cursor_Drag(x=False, y=False), hover=uplot.Cursor_Hover(prox=NEAR_PX, skip=(np.nan,))
+            ),
             padding=(6, 14, 0, 0),
             visible=False,
         )
 
-    def show(self, names: list[str], columns: tuple[NDArray[np.float64], ...]) -> None:
-        """Draw columns (frame numbers first) under ``names``, with an explicit range."""
+    def show(self, names: list[str], columns: tuple[NDArray[np.float64], ...], frame: int) -> None:
+        """Draw columns (frame numbers first) under ``names``, with an explicit range. frame: the one that is shown."""
         names = [n for n, column in zip(names, columns[1:], strict=True) if np.isfinite(column).any()]
         columns = (columns[0], *(c for c in columns[1:] if np.isfinite(c).any()))
         if not names or len(columns[0]) < 2:
@@ -52,12 +62,15 @@ class Chart:
             lines = [_line(name, k) for k, name in enumerate(names)]
             if self._markers and len(names) > 1:
                 lines[-1] = _dots(names[-1])
-            self._plot.series = (uplot.Series(label="frame"), *lines)
+            self._plot.series = (uplot.Series(label="frame"), *lines, *self._upright)
         high = max(float(np.nanmax(c) if self._peaks else np.nanpercentile(c, 97)) for c in columns[1:])
+        top = high * 1.08 + 1e-6
+        if self._upright:
+            columns = with_upright(columns, frame, top)
         self._plot.visible = True
         self._plot.scales = {
             "x": uplot.Scale(time=False, range=(float(columns[0][0]), float(columns[0][-1]))),
-            "y": uplot.Scale(range=(0.0, high * 1.08 + 1e-6)),
+            "y": uplot.Scale(range=(0.0, top)),
         }
         self._plot.data = columns
 
@@ -69,9 +82,9 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
-        self._error = Chart(hub, "Error so far (ATE, cm)", legend=False)
+        self._error = Chart(hub, "Error so far (ATE, cm)")
         self._losses = Chart(hub, "Weighted losses")
-        self._residual = Chart(hub, "Distance to the surface (mm)", legend=False)
+        self._residual = Chart(hub, "Distance to the surface (mm)")
         self._times = Chart(hub, "Time per frame (ms)", peaks=False)
         self._shown = 0.0
 
@@ -85,10 +98,26 @@ class Panel(BasePanel):
         losses = [name for name in names if not name.endswith(_RESIDUAL)]
         residual = [name for name in names if name.endswith(_RESIDUAL)]
         with self.hub.server.atomic():
-            self._error.show(["ATE"], history.series(["ate_cm"]))
-            self._losses.show([n.removeprefix("loss ").replace("_", " ") for n in losses], history.series(losses))
-            self._residual.show(residual, history.series(residual))
-            self._times.show(["tracking", "mapping"], history.series(["track_ms", "map_ms"]))
+            self._error.show(["ATE"], history.series(["ate_cm"]), s.frame)
+            self._losses.show(list(map(_label, losses)), history.series(losses), s.frame)
+            self._residual.show(list(map(_label, residual)), history.series(residual), s.frame)
+            self._times.show(["tracking", "mapping"], history.series(["track_ms", "map_ms"]), s.frame)
+
+
+def with_upright(columns: tuple[NDArray[np.float64], ...], frame: int, top: float) -> tuple[NDArray[np.float64], ...]:
+    """Columns (frame numbers first) and one more, which is an upright line up to ``top`` at the row nearest ``frame``.
+
+    That row comes twice, for the two ends of the line.
+    """
+    at = int(np.argmin(np.abs(columns[0] - frame)))
+    twice = tuple(np.insert(column, at, column[at]) for column in columns)
+    upright = np.full(len(twice[0]), np.nan)
+    upright[at : at + 2] = 0.0, top
+    return (*twice, upright)
+
+
+def _label(name: str) -> str:
+    return name.removeprefix("loss ").removesuffix(_RESIDUAL).replace("_", " ")
 
 
 def _line(name: str, index: int) -> uplot.Series:

@@ -21,22 +21,22 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
-        gui, last = hub.server.gui, len(hub.replay.run.rows) if hub.replay else 1
-        self._slider = gui.add_slider("Frame", 1, max(last, 2), 1, last)
+        gui, last = hub.server.gui, hub.replay.run.last if hub.replay else 0
+        self._slider = gui.add_slider("Frame", 0, max(last, 1), 1, last)
         self._asked: int | None = None
         hub.on(self._slider, lambda event: self._go_to(int(self._slider.value)))
-        verbs = gui.add_button_group("Replay", tuple(_VERBS))
+        verbs = gui.add_button_group("Replay", tuple(_VERBS), hint="Space plays and pauses, n goes one step")
         hub.commands(verbs, lambda: _VERBS[verbs.value])
         speed = gui.add_slider("Frames per second", 1, 60, 1, 20)
         hub.on(speed, lambda event: hub.submit(SpeedLimit(float(speed.value)), event.client))
 
     def snapshot(self, s: Snapshot) -> None:
-        if self._asked == s.frame + 1:
+        if self._asked == s.frame:
             self._asked = None
-        if self._asked is None and int(self._slider.value) != s.frame + 1:
-            put(self._slider, s.frame + 1)
+        if self._asked is None and int(self._slider.value) != s.frame:
+            put(self._slider, s.frame)
 
     def _go_to(self, frame: int) -> None:
         """Until the replay is at ``frame``, what it shows on the way must not move the slider under the hand."""
         self._asked = frame
-        self.hub.submit(RunTo(frame - 1))
+        self.hub.submit(RunTo(frame))

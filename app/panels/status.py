@@ -58,8 +58,9 @@ class Panel(BasePanel):
         self._html.content = render(s, _COMING[type(self._halting)] if self._halting else "")
 
     def ack(self, ack: Ack) -> None:
-        """Answer at once; a halt that waits for the frame at work keeps its word until it has come about."""
-        if ack.error or type(ack.command) not in _COMING:
+        """Answer at once; a halt that waits for the frame at work keeps its word until it has come about. A replay has
+        done what it acknowledges."""
+        if ack.error or type(ack.command) not in _COMING or self.hub.replay is not None:
             return
         halts = isinstance(ack.command, (Pause, Stop))
         if halts and self.hub.current is not None and self.hub.current.state in _SETTLED:
@@ -92,7 +93,7 @@ def render(s: Snapshot | None, coming: str) -> str:
     return (
         f'<div class="ec"><div class="ec-head">{theme.chip(coming or WORDS[s.state], color)}'
         f'<span class="ec-name dim">{escape(s.sequence)} · {escape(s.preset)}</span></div>'
-        f'<div class="ec-row"><span>Frame <b>{s.frame + 1}</b> of {s.frames_total}</span>'
-        f'<span class="dim">{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
+        f'<div class="ec-row"><span>Frame <b>{s.frame}</b></span><span class="dim">{s.frame + 1} of {s.frames_total}, '
+        f'{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
         f'<div class="ec-grid">{"".join(cells)}</div>{_LEGEND}{"".join(notes)}</div>'
     )

@@ -23,7 +23,7 @@ class Panel(BasePanel):
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
         gui = hub.server.gui
-        mode = gui.add_button_group("Mesh", MESH_MODES)
+        mode = gui.add_dropdown("Mesh", MESH_MODES)
         hub.on(mode, lambda event: self._set_mode(mode.value))
         if hub.replay is None:
             detail = gui.add_slider(

@@ -137,13 +137,14 @@ class Control:
             self._changed.notify_all()
 
     def _steer(self, command: Pause | Resume | Step | RunTo | Stop) -> None:
-        self._require_run()
         if isinstance(command, Stop):
             self._stop = True
             self._leave_at = min(self._leave_at, monotonic() + GRACE_S)
-        elif isinstance(command, RunTo):
+            return
+        self._require_run()
+        if isinstance(command, RunTo):
             if not self.position <= command.frame < self._total:
-                raise InputError(f"cannot run to frame {command.frame + 1}; {self._ahead()}")
+                raise InputError(f"cannot run to frame {command.frame}; {self._ahead()}")
             self._paused, self._pause_at = False, command.frame + 1
         else:
             self._paused = isinstance(command, Pause)
@@ -157,8 +158,8 @@ class Control:
             raise InputError("the run is over; restart it")
 
     def _ahead(self) -> str:
-        """Which frames are to come, counted from 1."""
-        return f"{self.position + 1} .. {self._total} lie ahead" if self.position < self._total else "none lies ahead"
+        """Which frames are to come."""
+        return f"{self.position} .. {self._total - 1} lie ahead" if self.position < self._total else "none lies ahead"
 
     def _enqueue(self, command_id: int, command: RequestMesh | RequestPictures | Export) -> None:
         if isinstance(command, Export) and command.format not in ("", *EXPORTS.get(command.kind, ())):
@@ -247,7 +248,7 @@ class Control:
     def wait_for(self, done: Callable[[], bool]) -> bool:
         """Wait until ``done`` answers True; False when a restart or the end of the engine comes first. See ``wake``."""
         with self._changed:
-            self._changed.wait_for(lambda: done() or self.leaving)
+            self._changed.wait_for(lambda: done() or self.quitting or self._restart is not None)
             return done()
 
     def wake(self) -> None:
@@ -283,8 +284,9 @@ class Control:
 
     @property
     def leaving(self) -> bool:
-        """Whether the run's last mapping is to be left out: a restart or the end of the engine waits for it."""
-        return self.quitting or self._restart is not None
+        """Whether the run's last mapping is to be left out: a restart or the end of the engine waits for it, or it has
+        been stopped itself."""
+        return self.quitting or self._restart is not None or (self.over and self._stop)
 
     @property
     def leave_now(self) -> bool:

@@ -308,7 +308,7 @@ class Engine:
             if isinstance(command, (Tune, LoadPreset)):
                 run.configure(self._control.config)
                 what = f"{command.key} = {command.value}" if isinstance(command, Tune) else f"preset {command.name}"
-                run.notice("info", f"{what} from frame {run.tally.position + 1} on", run.tally.position)
+                run.notice("info", f"{what} from frame {run.tally.position} on", run.tally.position)
         self._workshop.take_up(run, orders)
 
     def _in_between(self, run: Run) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from .. import config as configuration
 from ..evaluation.trajectory_io import format_kitti, format_tum
-from ..messages import Event, Export, Exported, FramePictures, Notice
+from ..meshing import MeshingStopped
+from ..messages import Event, Export, Exported, FramePictures
 from ..types import InputError
 from .mesh_files import mesh_bytes
 from .meshjobs import FrozenMap, build_mesh
@@ -28,18 +29,22 @@ def export_job(
     publish: Callable[[Event], None],
     should_stop: Callable[[], bool],
 ) -> Callable[[], None]:
-    """A job that writes the file and publishes ``Exported``. What it needs of the run is read now, in this thread."""
+    """A job that writes the file and publishes ``Exported``, also when it could not be written. What it needs of the
+    run is read now, in this thread."""
     if export.kind == "run":
         run.write_trajectory()
     make = _maker(run, export, frozen, should_stop)
     name = f"exports/{export.kind}-{max(run.tally.position - 1, 0):06d}{_ending(export)}"
 
     def job() -> None:
-        path = zip_run(run.folder.path, name) if export.kind == "run" else run.folder.write(name, make())
-        if path is None:
-            publish(Notice("error", f"{export.kind} was not exported: {run.folder.not_saved.get(name, 'no file')}"))
-        else:
-            publish(Exported(export.kind, str(path), command_id))
+        path, error = None, ""
+        try:
+            path = zip_run(run.folder.path, name) if export.kind == "run" else run.folder.write(name, make())
+        except MeshingStopped:
+            raise
+        except Exception as problem:
+            error = str(problem) or type(problem).__name__
+        publish(Exported(export.kind, str(path or ""), command_id, error or run.folder.not_saved.get(name, "")))
 
     return job
 

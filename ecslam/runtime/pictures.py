@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ..messages import FramePictures
 
 MAX_DIFFERENCE_M = 0.10
+SCALE_TOP, SCALE_BOTTOM, SCALE_LEFT, SCALE_RIGHT = 4, 12, 12, 38  # pixels from the picture's top, left and right edge
 
 
 def shrink(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
@@ -51,8 +52,19 @@ def six_pictures(
         color_difference=np.asarray(cv2.absdiff(color, color_rendered), np.uint8),
         depth=_tinted(depth / far, has),
         depth_rendered=_tinted(depth_rendered / far, depth_rendered > 0),
-        depth_difference=_tinted(gap / MAX_DIFFERENCE_M, has),
+        depth_difference=with_scale(_tinted(gap / MAX_DIFFERENCE_M, has), f"{100 * MAX_DIFFERENCE_M:.0f} cm"),
     )
+
+
+def with_scale(picture: NDArray[np.uint8], most: str) -> NDArray[np.uint8]:
+    """A tinted picture [h, w, 3] whose top edge says which colours stand for 0 to ``most``."""
+    out, right = picture.copy(), picture.shape[1] - SCALE_RIGHT
+    out[: SCALE_TOP + SCALE_BOTTOM] = 0
+    bar = out[SCALE_TOP:SCALE_BOTTOM, SCALE_LEFT:right]
+    bar[:] = _tinted(np.linspace(0, 1, bar.shape[1])[None], np.ones((1, 1), bool))
+    for text, x in (("0", 1), (most, right + 3)):
+        cv2.putText(out, text, (x, SCALE_BOTTOM), cv2.FONT_HERSHEY_SIMPLEX, 0.33, (255, 255, 255), 1, cv2.LINE_AA)
+    return out
 
 
 def _tinted(share: NDArray[np.floating], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -75,6 +75,7 @@ class Run:
         self.report: StepReport | None = None
         self.ate_cm: Spread | None = None
         self.map_loss: float | None = None
+        self.last_mapping = ""
         self.loops: list[LoopEvent] = []
         self._emit, self._make = emit, make
         self._checkpoints = CheckpointWriter(
@@ -253,8 +254,9 @@ class Run:
             return_holes()
 
     def configure(self, config: Config) -> None:
-        """Other tracking and mapping settings from the next frame on."""
+        """Other tracking and mapping settings from the next frame on; ``config.yaml`` holds the newest ones."""
         self.config = config
+        self.folder.write("config.yaml", configuration.to_yaml(config))
         if self.slam is not None:
             self.slam.configure(config)
 
@@ -343,7 +345,7 @@ class Run:
         """
         if complete and self.slam is not None and self.tally.rows and not self.torn and not self._settled:
             try:
-                self.slam.finish(interrupt)
+                self.slam.finish(self._counted(interrupt))
             except Abandoned:
                 complete, self.torn = False, True
         self.clock.pause()
@@ -352,6 +354,21 @@ class Run:
         self.write_trajectory()
         self.checkpoint(finished=complete)
         self._checkpoints.wait()
+
+    def _counted(self, interrupt: Callable[[], None]) -> Callable[[], None]:
+        """``interrupt`` for the last mapping, which also says how far that is (not on a GPU, where an iteration has no
+        call of its own)."""
+        mapping, done = self.config.mapping, 0
+        total = mapping.iterations + mapping.final_iterations
+
+        def counted() -> None:
+            nonlocal done
+            done += 1
+            how_far = f" {done}/{total}" if self.plan.device == "cpu" else ""
+            self.last_mapping = f"Last mapping{how_far}; Stop leaves out the rest"
+            interrupt()
+
+        return counted
 
     def close(self, export_s: float) -> dict[str, Any]:
         """Write ``summary.json`` and close the logs; the summary comes back. ``end`` has been called before."""

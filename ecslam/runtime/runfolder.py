@@ -2,7 +2,7 @@
 
 run.json         sequence (address), name, layout, frames (the A:B:STEP asked for), frames_total, device, width, height,
                  fx, fy, cx, cy
-config.yaml      the resolved configuration
+config.yaml      the resolved configuration; what was changed on the way, and when, is a notice in events.jsonl
 trajectory.txt   TUM format (timestamp tx ty tz qx qy qz qw), final poses, one line for each frame that was processed
 groundtruth.txt  the same for the frames that have ground truth; absent without any
 metrics.jsonl    a line for each frame, as it was then: frame, timestamp, c2w (12 numbers, the upper 3x4 row by row),

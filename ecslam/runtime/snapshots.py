@@ -54,6 +54,6 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
         loops=tuple(run.loops),
         skipped=tally.skipped,
         lost_frames=tally.lost,
-        reason=reason,
+        reason=reason or (run.last_mapping if state is State.MAPPING else ""),
         map_loss=run.map_loss,
     )

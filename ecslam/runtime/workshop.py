@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..messages import Command, Export, MeshReady, Notice, RequestMesh, RequestPictures
+from ..messages import Command, Export, Exported, MeshReady, Notice, RequestMesh, RequestPictures
 from ..types import Frame, InputError
 from .control import Control
 from .exports import export_job, render_pictures
@@ -64,7 +64,11 @@ class Workshop:
                 elif isinstance(command, Export):
                     self._jobs.submit(export_job(run, command, command_id, frozen, self._feed.publish, self._leaving))
             except Exception as error:
-                self._complain(str(error) or type(error).__name__)
+                why = str(error) or type(error).__name__
+                if isinstance(command, Export):
+                    self._feed.publish(Exported(command.kind, "", command_id, why))
+                else:
+                    self._complain(why)
 
     def _mesh_job(self, frozen: FrozenMap, order: RequestMesh) -> Callable[[], None]:
         live, over = self._live, self._over()
