@@ -25,7 +25,6 @@ from .types import Frame, Intrinsics
 
 LEAST_SEEN = 0.1
 LEAST_POINTS = 64  # that are measured, or a frame is not tracked
-WORSE = 1.02  # a rendered pose may cost this much more on the aligned surface, or the aligned pose stays
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class HostTracker:
 
     def track(self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config) -> TrackResult:
         """See ``Tracker``. Direct alignment of points spread over the image, then the paper's rendered tracking; the
-        preset may leave either out."""
+        preset may leave either out. A rendered pose that costs more on the aligned surface is not taken."""
         surface, measured = self.surface, spread_pixels(frame, self.camera, config.align.points, config, self.rng)
         if len(measured.points()) < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
@@ -77,8 +76,8 @@ class HostTracker:
             pixels = self.observed.known(pixels, c2w, same_count=field.device.type != "cpu")
             generator = self.generator or seeded(self.rng, field.device)
             rendered, losses = track_adam(field, self.kernels, pixels, c2w, config, generator, self.recorder)
-            agreed = WORSE * cost_at(surface, points, c2w, config)
-            if config.align.to == "none" or cost_at(surface, points, rendered, config) <= agreed:
+            before, after = (cost_at(surface, points, pose, config) for pose in (c2w, rendered))
+            if config.align.to == "none" or after <= before:
                 c2w = rendered
         return TrackResult(c2w, losses, fit(surface, measured, c2w, config.truncation_m))
 

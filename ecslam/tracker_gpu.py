@@ -27,7 +27,7 @@ from .pixels_gpu import DeviceFrame, choose, compacted, grid_cells, light_of, pa
 from .pose_adam import pose_rates
 from .rays import DevicePixels, kernel_weights, make_rays
 from .samples import uniform
-from .tracker import LEAST_POINTS, LEAST_SEEN, WORSE, TrackResult, descend_rendered
+from .tracker import LEAST_POINTS, LEAST_SEEN, TrackResult, descend_rendered
 from .types import Frame, Intrinsics
 from .volume_gpu import RULES, GpuVolume
 
@@ -93,7 +93,7 @@ class GpuTracker:
             pixels = self._known(choose(frame, self.camera, config, corners, order, jitter[:, :3].contiguous()), pose)
             rendered, terms = self._rendered(field, config, pixels, pose, rates, jitter[:, 3:])
             costs = [_objective(blocks, packed, _row(c2w, count), settings[-1]) for c2w in (pose, rendered)]
-            pose = torch.where(costs[1] <= WORSE * costs[0], rendered, pose)
+            pose = torch.where(costs[1] <= costs[0], rendered, pose)
         fit, usable = self._fit(blocks, measured, pose, 0.5 * config.truncation_m)
         cost = row[COST.value] / count.clamp_min(1)
         return (torch.cat([pose[:3].reshape(12), torch.stack([cost, fit, usable]), terms.double()]),)
