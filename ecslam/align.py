@@ -19,11 +19,10 @@ from .descent import Alignment, descend, objective
 from .field import TsdfField
 from .kernels import AlignSettings, Backend, NormalEquations
 from .observed import ObservedVoxels
-from .pixels import Pixels, Points
+from .pixels import LUMINANCE, Pixels, Points
 
 WIDE_GRADIENT = (0.3, 2.0)
 LEAST_KNOWN = 100
-LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255
 
 
 class Surface(Protocol):

@@ -15,6 +15,8 @@ from torch import Tensor
 from .config import Config
 from .types import Corners, Frame, Intrinsics
 
+LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255  # of red, green and blue in 0..255
+
 
 @dataclass(frozen=True, slots=True)
 class Pixels:

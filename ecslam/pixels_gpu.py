@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config
-from .pixels import border_of, feature_points, grid_shape
+from .pixels import LUMINANCE, border_of, feature_points, grid_shape
 from .rays import DevicePixels
 from .types import Frame, Intrinsics
-
-LUMINANCE = (0.299 / 255, 0.587 / 255, 0.114 / 255)
 
 
 @dataclass(frozen=True)
@@ -77,8 +75,8 @@ def choose(
 
 def light_of(pixels: DevicePixels) -> Tensor:
     """Luminance [N] in 0..1."""
-    red, green, blue = pixels.color.float().unbind(1)
-    return LUMINANCE[0] * red + LUMINANCE[1] * green + LUMINANCE[2] * blue
+    (red, green, blue), (r, g, b) = pixels.color.float().unbind(1), LUMINANCE.tolist()
+    return r * red + g * green + b * blue
 
 
 def compacted(keep: Tensor) -> tuple[Tensor, Tensor]:

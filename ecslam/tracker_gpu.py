@@ -20,7 +20,6 @@ from .descent import COARSE_STRIDE, outlier_cost
 from .field import TsdfField
 from .kernels import LOSS_NAMES, AlignSettings, Backend, RayBatch, fusion_gpu
 from .kernels._gpu_blocks import Blocks
-from .kernels._gpu_descent import COST, COUNT, POSE, ROW
 from .kernels.graphs import Recorder
 from .observed_gpu import ObservedTable
 from .pixels_gpu import DeviceFrame, choose, compacted, grid_cells, light_of, padded_corners, spread
@@ -86,17 +85,20 @@ class GpuTracker:
         cells = grid_cells(frame, a.points, config)
         measured = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2))
         packed, count = self._packed(blocks, measured, start)
-        row = fusion_gpu.descend(blocks, packed, _row(start, count), settings, a.iterations, COARSE_STRIDE, RULES)
-        pose, terms = _pose_of(row), start.new_empty(0)
+        row = fusion_gpu.descend(
+            blocks, packed, fusion_gpu.pack_start(start, count), settings, a.iterations, COARSE_STRIDE, RULES
+        )
+        (pose, cost), terms = fusion_gpu.unpack_pose(row), start.new_empty(0)
         if config.tracking.iterations:
             jitter = numbers[2 * cells :].view(config.tracking.rays, -1)
             pixels = self._known(choose(frame, self.camera, config, corners, order, jitter[:, :3].contiguous()), pose)
             rendered, terms = self._rendered(field, config, pixels, pose, rates, jitter[:, 3:])
-            costs = [_objective(blocks, packed, _row(c2w, count), settings[-1]) for c2w in (pose, rendered)]
+            costs = [_objective(blocks, packed, c2w, count, settings[-1]) for c2w in (pose, rendered)]
             pose = torch.where(costs[1] <= costs[0], rendered, pose)
         fit, usable = self._fit(blocks, measured, pose, 0.5 * config.truncation_m)
-        cost = row[COST.value] / count.clamp_min(1)
-        return (torch.cat([pose[:3].reshape(12), torch.stack([cost, fit, usable]), terms.double()]),)
+        return (
+            torch.cat([pose[:3].reshape(12), torch.stack([cost / count.clamp_min(1), fit, usable]), terms.double()]),
+        )
 
     def _packed(self, blocks: Blocks, measured: DevicePixels, start: Tensor) -> tuple[Tensor, Tensor]:
         """Points and luminance [N, 4], those first that are to be aligned, and how many these are: see
@@ -150,22 +152,7 @@ def _moved(c2w: Tensor, local: Tensor) -> Tensor:
     return torch.stack([x * row[0] + y * row[1] + z * row[2] + row[3] for row in c2w[:3]], 1)
 
 
-def _row(c2w: Tensor, count: Tensor) -> Tensor:
-    """See ``fusion_gpu.pack_start``."""
-    row = c2w.new_zeros(ROW)
-    row[POSE.value : POSE.value + 12] = c2w[:3].reshape(12)
-    row[COUNT.value] = count
-    return row
-
-
-def _pose_of(row: Tensor) -> Tensor:
-    """The pose [4, 4] of a row."""
-    c2w = torch.eye(4, dtype=row.dtype, device=row.device)
-    c2w[:3] = row[POSE.value : POSE.value + 12].view(3, 4)
-    return c2w
-
-
-def _objective(blocks: Blocks, packed: Tensor, row: Tensor, settings: AlignSettings) -> Tensor:
-    """See ``descent.objective``, with the sums taken at the pose of ``row``."""
-    sums = fusion_gpu.sums_at(blocks, packed, row, settings)
-    return sums[64] + outlier_cost(settings) * (row[COUNT.value] - sums[65])
+def _objective(blocks: Blocks, packed: Tensor, c2w: Tensor, count: Tensor, settings: AlignSettings) -> Tensor:
+    """See ``descent.objective``, with the sums of ``count`` points taken at c2w [4, 4]."""
+    sums = fusion_gpu.sums_at(blocks, packed, fusion_gpu.pack_start(c2w, count), settings)
+    return sums[64] + outlier_cost(settings) * (count - sums[65])

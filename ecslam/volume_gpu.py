@@ -130,7 +130,7 @@ class GpuVolume:
         packed, start = self._packed(points), self._start(guess, points)
         (row,) = self._record(whole, packed, start, key=(stages, iterations), over=(blocks,))
         c2w, cost = fusion_gpu.unpack_pose(row.cpu())
-        return Alignment(c2w.numpy(), cost / max(len(points.local), 1))
+        return Alignment(c2w.numpy(), float(cost) / max(len(points.local), 1))
 
     def _packed(self, points: Points) -> Tensor:
         """Points and luminance [N, 4], padded to one of few sizes."""

@@ -5,15 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-
-@triton.jit
-def three(at, p, pitch: tl.constexpr, live):
-    """Three numbers in a row of every pose p, float64."""
-    return (
-        tl.load(at + pitch * p, live, 0.0).to(tl.float64),
-        tl.load(at + pitch * p + 1, live, 0.0).to(tl.float64),
-        tl.load(at + pitch * p + 2, live, 0.0).to(tl.float64),
-    )
+from ._gpu_points import triple
 
 
 @triton.jit
@@ -81,8 +73,8 @@ def pose_kernel(
     ``turns_about`` says that there is one."""
     p = tl.program_id(0) * block + tl.arange(0, block)
     live = p < poses
-    r0, r1, r2 = three(c2w, p, 16, live), three(c2w + 4, p, 16, live), three(c2w + 8, p, 16, live)
-    g0, g1, g2 = three(d_c2w, p, 12, live), three(d_c2w + 4, p, 12, live), three(d_c2w + 8, p, 12, live)
+    r0, r1, r2 = triple(c2w + 16 * p, live), triple(c2w + 4 + 16 * p, live), triple(c2w + 8 + 16 * p, live)
+    g0, g1, g2 = triple(d_c2w + 12 * p, live), triple(d_c2w + 4 + 12 * p, live), triple(d_c2w + 8 + 12 * p, live)
     pull = (
         tl.load(d_c2w + 12 * p + 3, live, 0.0).to(tl.float64),
         tl.load(d_c2w + 12 * p + 7, live, 0.0).to(tl.float64),
@@ -92,7 +84,7 @@ def pose_kernel(
     zero = tl.zeros_like(pull[0])
     centre = (zero, zero, zero)
     if turns_about:
-        centre = three(about, p, 3, live)
+        centre = triple(about + 3 * p, live)
         lever = cross((dot(r0, centre), dot(r1, centre), dot(r2, centre)), pull)
         twist = twist[0] - lever[0], twist[1] - lever[1], twist[2] - lever[2]
     scale = keep, add, left, epsilon

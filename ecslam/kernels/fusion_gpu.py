@@ -93,19 +93,19 @@ def distances(blocks: Blocks, points: Tensor) -> Tensor:
     return found
 
 
-def pack_start(c2w: Tensor, count: int) -> Tensor:
-    """The row from which an alignment of ``count`` points starts at c2w [4, 4], on the CPU."""
-    row = torch.zeros(ROW, dtype=torch.float64)
+def pack_start(c2w: Tensor, count: int | Tensor) -> Tensor:
+    """The row from which an alignment of ``count`` points starts at c2w float64 [4, 4], where that lies."""
+    row = torch.zeros(ROW, dtype=torch.float64, device=c2w.device)
     row[POSE.value : POSE.value + 12] = c2w[:3].reshape(12)
     row[COUNT.value] = count
     return row
 
 
-def unpack_pose(row: Tensor) -> tuple[Tensor, float]:
-    """The pose [4, 4] of a row on the CPU, and its cost."""
-    c2w = torch.eye(4, dtype=torch.float64)
+def unpack_pose(row: Tensor) -> tuple[Tensor, Tensor]:
+    """The pose [4, 4] of a row, and its cost [], where the row lies."""
+    c2w = torch.eye(4, dtype=row.dtype, device=row.device)
     c2w[:3] = row[POSE.value : POSE.value + 12].view(3, 4)
-    return c2w, float(row[COST.value])
+    return c2w, row[COST.value]
 
 
 def _add_sums(

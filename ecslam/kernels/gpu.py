@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
+from .types import HIDDEN, AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
 
 if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
     raise ImportError("no CUDA device")
@@ -38,7 +38,6 @@ WEIGHTS_BLOCK, WEIGHTS_WARPS = 64, 4  # as for the values
 GRID_BLOCK, GRID_WARPS = 32, 4  # no products; timed against 8 warps and 64 points on an H200
 ALIGN_BLOCK, ALIGN_WARPS = 32, 4  # the gradients in space spill registers, and with 64 points far more
 PLACE_BLOCK = 128  # one point a thread
-HIDDEN = 64  # units of both decoders
 RAY_ELEMENTS = 512  # padded samples that one program renders
 PROGRAMS_A_PROCESSOR = 2
 
@@ -208,7 +207,7 @@ def _step(
     """Add to ``losses``, to ``into`` and to ``d_c2w``, where they are wanted."""
     field, beta, shape = _field(layout, params), _flat(params.beta), _shape(layout)
     total, placed = points.total, _place(layout, field, points, True)
-    of_features, hidden = (2, layout.levels, total), beta.new_empty(total, HIDDEN)
+    of_features, hidden = (2, layout.levels, total), beta.new_empty(total, 2 * HIDDEN)
     features = None if into is None else beta.new_empty(of_features)
     slopes = None if d_c2w is None else beta.new_empty(3, *of_features)
     sdf, rgb = _evaluate(layout, field, placed, Kept(features, slopes, hidden))
