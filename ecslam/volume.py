@@ -4,8 +4,9 @@ needs no training (Curless and Levoy 1996; sparse blocks as in Niessner et al. 2
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -44,26 +45,29 @@ class FusedVolume:
         depth = np.where((frame.depth >= near_m) & (frame.depth <= far_m), frame.depth, np.float32(0))
         light = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1 / 255)
         numbers = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        step = fusion.NORMAL_STRIDE
+        step, threads = fusion.NORMAL_STRIDE, torch.get_num_threads()
         normal = np.empty((-(-depth.shape[0] // step), -(-depth.shape[1] // step), 3), np.float32)
-        fusion.normals(depth, numbers, normal)
+        edges = np.linspace(0, len(normal), threads + 1).astype(int)
+        parts = [_pool().submit(fusion.normals, depth, numbers, normal, *rows) for rows in pairwise(edges)]
         view = fusion.View(depth, light, normal, numbers, np.ascontiguousarray(c2w))
-        reach = self.truncation_m
-        self._now += 1
-        while True:
-            used, listed = fusion.touch(
-                self._blocks, self.used, view, STRIDE, reach, self.voxel_m, self._stamp, self._now, self._listed
-            )
-            self.used = used
-            if listed >= 0:
-                break
-            self._grow()
-            self._now += 1
-        halves = np.array_split(self._listed[:listed], torch.get_num_threads())
+        listed = self._touch(view)
+        _wait(parts)
+        halves = np.array_split(listed, threads)
         parts = [_pool().submit(fusion.integrate, self._blocks, rows, view, *self._lengths) for rows in halves[1:]]
         fusion.integrate(self._blocks, halves[0], view, *self._lengths)
-        for part in parts:
-            part.result()
+        _wait(parts)
+
+    def _touch(self, view: fusion.View) -> NDArray[np.int64]:
+        """The rows of the blocks near what a view measured, made where there were none."""
+        while True:
+            self._now += 1
+            self.used, listed = fusion.touch(
+                *(self._blocks, self.used, view, STRIDE, self.truncation_m, self.voxel_m),
+                *(self._stamp, self._now, self._listed),
+            )
+            if listed >= 0:
+                return self._listed[:listed]
+            self._grow()
 
     def _grow(self) -> None:
         self._load(self._blocks.place[: self.used], self._blocks.voxels[: self.used], 2 * len(self._blocks.place))
@@ -123,6 +127,11 @@ def create_volume(
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(torch.get_num_threads(), "fusion")
+
+
+def _wait(parts: list[Future[None]]) -> None:
+    for part in parts:
+        part.result()
 
 
 def _allocate(rows: int) -> fusion.Blocks:
