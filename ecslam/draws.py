@@ -20,6 +20,7 @@ from .rays import DevicePixels, gather, make_rays, upload
 from .samples import LEAST_UNIFORM, rendered_depths, resample_missing, uniform
 
 Draw = Callable[[int, Tensor], RayBatch]
+AHEAD = 10
 
 
 def shares(views: int, rays: int, newest_share: float) -> list[int]:
@@ -30,28 +31,46 @@ def shares(views: int, rays: int, newest_share: float) -> list[int]:
     return [older] * (views - 1) + [newest]
 
 
-def host_draw(
-    views: Sequence[Pixels],
-    config: Config,
-    field: TsdfField,
-    kernels: Backend,
-    rng: np.random.Generator,
-    generator: torch.Generator,
-) -> Draw:
-    """Rays for (iteration, poses [W, 4, 4]), on the CPU."""
-    m, s = config.mapping, config.sampling
-    counts = shares(len(views), m.rays, m.newest_share)
+class HostDraw:
+    """Rays for (iteration, poses [W, 4, 4]), on the CPU: ``AHEAD`` iterations' worth at a time, since one takes next to
+    nothing but the calls."""
 
-    def draw(iteration: int, c2w: Tensor) -> RayBatch:
-        picks = [rng.integers(0, len(view), count) for view, count in zip(views, counts, strict=True)]
-        pixels, row = gather(views, picks)
-        missing = bool((pixels.depth <= 0).any())
-        jitter = uniform(generator, c2w.device, len(pixels), s.uniform + s.near_depth)
-        chosen = upload(pixels, c2w.device)
-        rays = make_rays(chosen, torch.from_numpy(row), c2w, field.layout.box, config, jitter, missing)
-        return resample_missing(rays, c2w.float(), field, kernels, s, generator) if missing else rays
+    def __init__(
+        self,
+        views: Sequence[Pixels],
+        config: Config,
+        field: TsdfField,
+        kernels: Backend,
+        rng: np.random.Generator,
+        generator: torch.Generator,
+    ) -> None:
+        self._views, self._config, self._field, self._kernels = views, config, field, kernels
+        self._rng, self._generator, self._box = rng, generator, field.layout.box
+        self._counts = shares(len(views), config.mapping.rays, config.mapping.newest_share)
+        self._ahead: list[tuple[DevicePixels, Tensor, RayBatch]] = []
 
-    return draw
+    def __call__(self, iteration: int, c2w: Tensor) -> RayBatch:
+        """The rays of an iteration."""
+        if not self._ahead:
+            self._ahead = self._some(c2w)
+        pixels, jitter, rays = self._ahead.pop()
+        missing = torch.nonzero(rays.depth <= 0)[:, 0]
+        if not len(missing):
+            return rays
+        few = make_rays(pixels.take(missing), rays.pose[missing], c2w, self._box, self._config, jitter[missing], True)
+        few = resample_missing(few, c2w.float(), self._field, self._kernels, self._config.sampling, self._generator)
+        return replace(rays, z=rays.z.index_copy(0, missing, few.z))
+
+    def _some(self, c2w: Tensor) -> list[tuple[DevicePixels, Tensor, RayBatch]]:
+        """Pixels, random numbers in 0..1 [R, S] and rays of iterations; z of rays without depth is yet to be found."""
+        s, counts, rng = self._config.sampling, self._counts, self._rng
+        picks = [rng.integers(0, len(view), (AHEAD, count)) for view, count in zip(self._views, counts, strict=True)]
+        pixels = upload(gather(self._views, picks), c2w.device)
+        jitter = uniform(self._generator, c2w.device, len(pixels.depth), s.uniform + s.near_depth)
+        row = torch.from_numpy(np.tile(np.repeat(np.arange(len(counts)), counts), AHEAD))
+        rays = make_rays(pixels, row, c2w, self._box, self._config, jitter, missing=False)
+        parts = (slice(first, first + sum(counts)) for first in range(0, len(row), sum(counts)))
+        return [(pixels.take(part), jitter[part], rays.take(part)) for part in parts]
 
 
 @dataclass(frozen=True)

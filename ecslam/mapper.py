@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config
-from .draws import DeviceDraw, Draw, device_draw, host_draw, padded
+from .draws import DeviceDraw, Draw, HostDraw, device_draw, padded
 from .field import TsdfField, grow_field, map_params, regrow
 from .field_adam import FieldAdam
 from .kernels import LOSS_NAMES, Backend, FieldParams, RayBatch, Weights
@@ -103,7 +103,7 @@ class Mapper:
         job = Job(config, bool(not fixed.all()), smooth, settle)
         interrupt = interrupt or (lambda: None)
         if self.field.device.type == "cpu":
-            draw = host_draw(views, config, self.field, self.kernels, self._rng, self._generator)
+            draw = HostDraw(views, config, self.field, self.kernels, self._rng, self._generator)
             left = [1 - i / iterations for i in range(iterations)]
             moved, losses = self._iterate(job, draw, torch.from_numpy(c2w), job.pose_rates(fixed), left, interrupt)
         else:

@@ -26,7 +26,7 @@ class DevicePixels:
     color: Tensor
     feature: Tensor
 
-    def take(self, index: Tensor) -> DevicePixels:
+    def take(self, index: Tensor | slice) -> DevicePixels:
         """The pixels at ``index``."""
         return DevicePixels(*(getattr(self, f.name)[index] for f in fields(self)))
 
@@ -41,16 +41,13 @@ def upload(pixels: Pixels, device: torch.device) -> DevicePixels:
     )
 
 
-def gather(views: Sequence[Pixels], picks: Sequence[NDArray[np.int64]]) -> tuple[Pixels, NDArray[np.int64]]:
-    """The picked pixels of all views in one, and the view number [R] of each, ascending."""
-    taken = [view.take(pick) for view, pick in zip(views, picks, strict=True)]
-    joined = Pixels(
-        np.concatenate([t.direction for t in taken]),
-        np.concatenate([t.depth for t in taken]),
-        np.concatenate([t.color for t in taken]),
-        np.concatenate([t.feature for t in taken]),
+def gather(views: Sequence[Pixels], picks: Sequence[NDArray[np.int64]]) -> Pixels:
+    """The pixels that are picked [N, R_i] of each view, N times those of all views one after another."""
+    columns = (
+        np.concatenate([getattr(view, f.name)[pick] for view, pick in zip(views, picks, strict=True)], 1)
+        for f in fields(Pixels)
     )
-    return joined, np.repeat(np.arange(len(taken)), [len(t) for t in taken])
+    return Pixels(*(column.reshape(-1, *column.shape[2:]) for column in columns))
 
 
 def make_rays(

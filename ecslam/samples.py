@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -81,7 +81,7 @@ def resample_missing(
     missing = torch.nonzero(rays.depth <= 0)[:, 0]
     if config.uniform < LEAST_UNIFORM:
         return rays
-    few = RayBatch(*(getattr(rays, f.name)[missing] for f in fields(RayBatch)))
+    few = rays.take(missing)
     jitter = uniform(generator, rays.z.device, len(missing), rays.z.shape[1] - config.uniform)
     depths = rays.z.clone()
     depths[missing] = rendered_depths(few, c2w, field, kernels, config, jitter)

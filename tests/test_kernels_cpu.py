@@ -21,6 +21,7 @@ from kernel_cases import (
 from ecslam.config import FieldConfig
 from ecslam.field import grow_field, map_params
 from ecslam.kernels import FieldParams, reference
+from ecslam.pose_adam import PoseAdam
 
 cpu = pytest.importorskip("ecslam.kernels.cpu")
 SIZES = (0, 1, 63, 64, 65, 1000)
@@ -215,3 +216,19 @@ def test_numbers_that_are_not_numbers_stay_in_their_place():
     keep = torch.ones(100).bool()
     keep[[7, 9]] = False
     assert torch.equal(sdf[keep], clean[keep])
+
+
+@pytest.mark.parametrize("poses", [0, 1, 5, 33])
+@pytest.mark.parametrize("about", [True, False])
+def test_steps_of_the_poses(poses, about):
+    g = torch.Generator().manual_seed(0)
+    c2w, rates = make_poses(poses, g).double(), torch.rand(poses, 6, generator=g).double() * 0.3
+    rates[:1], rates[-1:] = 0, 1e-6
+    centre = torch.randn(poses, 3, generator=g).double() if about else None
+    mine, theirs = (PoseAdam(c2w, rates, 0.5, centre, kernels) for kernels in (cpu, reference))
+    for share in (1.0, 0.7, None):
+        gradient = torch.randn(poses, 3, 4, generator=g)
+        mine.step(gradient, share)
+        theirs.step(gradient, share)
+        torch.testing.assert_close(mine.c2w, theirs.c2w, rtol=0, atol=1e-12)
+    assert poses < 5 or (mine.c2w - c2w).abs().max() > 0.1

@@ -24,6 +24,7 @@ from torch import Tensor
 from ..compiled import drop_stale
 from ._cpu_field import Grid, Net, scratch_floats
 from ._cpu_math import BOTH, HALF
+from ._cpu_poses import pose_worker
 from ._cpu_rays import Rays, count_rays, pose_gradients
 from ._cpu_work import (
     add_partials,
@@ -35,7 +36,6 @@ from ._cpu_work import (
     table_worker,
     values_worker,
 )
-from .reference import pose_step as pose_step
 from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
 
 drop_stale(Path(__file__).parent, step_worker.stats.cache_path, "_cpu_*")
@@ -254,3 +254,23 @@ def normal_equations(
     return NormalEquations(
         total[:36].reshape(6, 6).clone(), total[36:42].clone(), float(total[42]), int(total[44]), int(total[43])
     )
+
+
+def pose_step(
+    c2w: Tensor,
+    d_c2w: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rates: Tensor,
+    about: Tensor | None,
+    decays: tuple[float, float],
+    epsilon: float,
+    count: int,
+) -> Tensor:
+    """See ``reference.pose_step``."""
+    moved = torch.empty_like(c2w)
+    turned_about = np.empty((0, 3)) if about is None else about.numpy()
+    poses, pulls = c2w.contiguous().numpy(), d_c2w.contiguous().numpy()
+    state = mean.numpy(), square.numpy(), rates.contiguous().numpy()
+    pose_worker(poses, pulls, *state, turned_about, decays, epsilon, count, moved.numpy())
+    return moved

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from torch import Tensor
 
@@ -73,6 +73,10 @@ class RayBatch:
     color: Tensor
     feature: Tensor
     pose: Tensor
+
+    def take(self, index: Tensor | slice) -> RayBatch:
+        """The rays at ``index``."""
+        return RayBatch(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
 @dataclass(frozen=True)
