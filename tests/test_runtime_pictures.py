@@ -1,8 +1,9 @@
 """The six pictures: what their colours mean is written into them."""
 
 import numpy as np
+import pytest
 
-from ecslam.runtime.pictures import SCALE_BOTTOM, SCALE_LEFT, SCALE_RIGHT, SCALE_TOP, six_pictures
+from ecslam.runtime.pictures import SCALE_BOTTOM, SCALE_LEFT, SCALE_RIGHT, SCALE_TOP, shrink, six_pictures
 
 
 def test_the_difference_of_depth_says_which_colour_stands_for_how_much():
@@ -15,3 +16,22 @@ def test_the_difference_of_depth_says_which_colour_stands_for_how_much():
     share = np.linspace(0, 159, bar.shape[1]).round().astype(int)
     assert np.abs(bar[0] - shown[60, share]).max() < 12, "0 is at its left end and 10 cm at its right one"
     assert (shown[: SCALE_BOTTOM + 1, -SCALE_RIGHT:] > 200).any(), "the label"
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"), [((680, 1200), (85, 150)), ((480, 640), (120, 160)), ((3, 900), (1, 150))]
+)
+def test_a_small_picture_shows_all_of_it(size, expected):
+    rows, columns = np.indices(size)
+    image = np.stack([255 * rows / size[0], 255 * columns / size[1], np.full(size, 7)], -1).astype(np.uint8)
+    small = shrink(image, 160)
+    assert small.shape == (*expected, 3)
+    edge = -(-size[1] // 160)
+    assert abs(float(small[..., 1].mean()) - image[..., 1].mean()) < 3
+    assert small[0, -1, 1] > 250 - 255 * edge / size[1] > small[0, 0, 1]
+    assert (small[..., 2] == 7).all()
+
+
+def test_a_picture_that_is_small_enough_stays():
+    image = np.zeros((10, 160, 3), np.uint8)
+    assert shrink(image, 160) is image
