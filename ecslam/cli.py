@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from . import config as configuration
+from . import config_files
+from .config import Config
 from .types import InputError, Sequence
 
 app = typer.Typer(
@@ -279,18 +280,18 @@ def resolve_config(
     settings: list[str] | None,
     seed: int | None,
     schedule: str | None,
-) -> configuration.Config:
+) -> Config:
     """Preset (the command's, the file's or the sequence's), what the layout asks for, then file, then single settings,
     then seed and schedule. Raises InputError."""
-    resolved = configuration.for_layout(configuration.load_preset(preset or sequence.preset), sequence.layout)
+    resolved = config_files.for_layout(config_files.load_preset(preset or sequence.preset), sequence.layout)
     if file is not None:
-        resolved = configuration.load_config(file, resolved, sequence.layout)
+        resolved = config_files.load_config(file, resolved, sequence.layout)
         if preset not in (None, resolved.preset):
             raise InputError(f"{file}: is for preset {resolved.preset}, not {preset}; leave --preset out, or change it")
-    resolved = configuration.apply_settings(resolved, settings or [])
+    resolved = config_files.apply_settings(resolved, settings or [])
     for key, value in (("seed", seed), ("schedule", schedule)):
         if value is not None:
-            resolved = configuration.apply(resolved, {key: value}, f"--{key}")
+            resolved = config_files.apply(resolved, {key: value}, f"--{key}")
     return resolved
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from . import datasets
+from . import config_files, datasets
 from .atomic import write_atomic
 from .config import Config
 from .datasets.meshes import NoSurface
@@ -323,9 +323,7 @@ def remesh(folder: Path, voxel_m: float, out: Path) -> None:
     checkpoint = load_checkpoint(folder / "checkpoints")
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
-    from . import config as configuration
-
-    config = configuration.apply(Config(), checkpoint.meta["config"], str(folder))
+    config = config_files.apply(Config(), checkpoint.meta["config"], str(folder))
     about = read_about(folder)
     camera = Intrinsics(**{name: about[name] for name in CAMERA})
     slam = Slam.restore(config, camera, checkpoint.arrays)

@@ -16,7 +16,7 @@ from ecslam_app.panel import TABS, BasePanel, find_panels
 from ecslam_app.panels.status import WORDS, render
 from ecslam_app.panels.status import Panel as Status
 
-from ecslam import config as configuration
+from ecslam import config_files
 from ecslam import messages as m
 from tests.fake_engine import FakeEngine, write_run
 from tests.test_app_security import control, dial, enter, hit, press, until
@@ -168,11 +168,9 @@ def test_a_new_run_of_equal_length_brings_its_own_truth_and_camera(engine, page)
 def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
     engine = FakeEngine(tmp_path / "run", frames=60)
     engine.run_folder.mkdir()
-    config = configuration.load_preset("live")
+    config = config_files.load_preset("live")
     settings = ["seed=7", "schedule=overlap", "mapping.iterations=23"]
-    (engine.run_folder / "config.yaml").write_text(
-        configuration.to_yaml(configuration.apply_settings(config, settings))
-    )
+    (engine.run_folder / "config.yaml").write_text(config_files.to_yaml(config_files.apply_settings(config, settings)))
     engine._preset = "live"
     page = server.start(engine.skip_to(3), port=0)
     try:

@@ -15,7 +15,7 @@ from ecslam_app.browser import PATIENCE_MS, dismiss_toasts, install_chromium, la
 from PIL import Image
 
 from ecslam import messages as m
-from ecslam.config import load_preset
+from ecslam.config_files import load_preset
 from ecslam.datasets import open_sequence
 from ecslam.runtime.engine import Engine
 from tests.fake_engine import FakeEngine, write_run

@@ -19,7 +19,7 @@ import torch
 
 from ecslam import cli, commands
 from ecslam.commands import draw_picture
-from ecslam.config import apply_settings, load_config, load_preset
+from ecslam.config_files import apply_settings, load_config, load_preset
 from ecslam.datasets.meshes import load_mesh
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.types import Mesh

@@ -4,12 +4,14 @@ import dataclasses
 
 import pytest
 
-from ecslam import config as cfg
+from ecslam import config_files
+from ecslam.config import Config
+from ecslam.config_files import apply_settings, for_layout, load_config, load_preset, preset_names, to_yaml
 from ecslam.types import InputError
 
 
 def test_defaults_are_the_papers_lite_preset():
-    assert cfg.load_preset("lite") == cfg.Config()
+    assert load_preset("lite") == Config()
 
 
 @pytest.mark.parametrize(
@@ -22,19 +24,19 @@ def test_defaults_are_the_papers_lite_preset():
     ],
 )
 def test_presets_carry_the_papers_counts(preset, mapping, tracking, samples):
-    c = cfg.load_preset(preset)
+    c = load_preset(preset)
     assert (c.mapping.iterations, c.mapping.rays) == mapping
     assert (c.tracking.iterations, c.tracking.rays) == tracking
     assert (c.sampling.uniform, c.sampling.near_depth) == samples
     assert c.preset == preset
 
 
-@pytest.mark.parametrize("preset", cfg.preset_names())
+@pytest.mark.parametrize("preset", preset_names())
 def test_resolved_configuration_reads_back_equal(preset, tmp_path):
-    c = cfg.load_preset(preset)
+    c = load_preset(preset)
     path = tmp_path / "config.yaml"
-    path.write_text(cfg.to_yaml(c))
-    assert cfg.load_config(path) == c
+    path.write_text(to_yaml(c))
+    assert load_config(path) == c
 
 
 @pytest.mark.parametrize(
@@ -64,36 +66,36 @@ def test_resolved_configuration_reads_back_equal(preset, tmp_path):
 )
 def test_wrong_settings_say_what_and_where(setting, says):
     with pytest.raises(InputError, match=says) as error:
-        cfg.apply_settings(cfg.Config(), [setting])
+        apply_settings(Config(), [setting])
     assert "\n" not in str(error.value)
 
 
 def test_something_must_track():
-    live = cfg.load_preset("live")
+    live = load_preset("live")
     with pytest.raises(InputError, match=r"--set: align.to is none and tracking.iterations is 0"):
-        cfg.apply_settings(live, ["align.to=none"])
-    assert cfg.apply_settings(live, ["align.to=none", "tracking.iterations=8"]).align.to == "none"
+        apply_settings(live, ["align.to=none"])
+    assert apply_settings(live, ["align.to=none", "tracking.iterations=8"]).align.to == "none"
 
 
 def test_settings_of_one_group_add_up_and_the_last_of_a_key_counts():
-    c = cfg.apply_settings(cfg.Config(), ["mapping={rays: 50, every: 10}", "mapping.rays=60", "seed=1", "seed=2"])
+    c = apply_settings(Config(), ["mapping={rays: 50, every: 10}", "mapping.rays=60", "seed=1", "seed=2"])
     assert (c.mapping.rays, c.mapping.every, c.mapping.iterations, c.seed) == (60, 10, 10, 2)
 
 
 def test_scientific_notation_is_a_number():
-    assert cfg.apply_settings(cfg.Config(), ["mapping.lr_grid=1e-3"]).mapping.lr_grid == 1e-3
+    assert apply_settings(Config(), ["mapping.lr_grid=1e-3"]).mapping.lr_grid == 1e-3
 
 
 def test_a_file_starts_from_the_preset_that_it_names(tmp_path):
     path = tmp_path / "c.yaml"
     path.write_text("preset: full\nmapping: {every: 10}")
-    full = cfg.load_preset("full")
+    full = load_preset("full")
     wanted = dataclasses.replace(full, mapping=dataclasses.replace(full.mapping, every=10))
-    assert cfg.load_config(path) == wanted
-    assert cfg.load_config(path, cfg.load_preset("live"), "synthetic") == wanted
-    assert cfg.load_config(path, cfg.load_preset("live"), "tum") == cfg.for_layout(wanted, "tum")
+    assert load_config(path) == wanted
+    assert load_config(path, load_preset("live"), "synthetic") == wanted
+    assert load_config(path, load_preset("live"), "tum") == for_layout(wanted, "tum")
     path.write_text("mapping: {every: 10}")
-    assert cfg.load_config(path, full) == wanted
+    assert load_config(path, full) == wanted
 
 
 @pytest.mark.parametrize(
@@ -117,26 +119,27 @@ def test_hostile_files_are_refused(text, says, tmp_path):
     path = tmp_path / "c.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=says):
-        cfg.load_config(path, cfg.Config())
+        load_config(path, Config())
 
 
 def test_missing_file_and_unknown_preset():
     with pytest.raises(InputError, match="did you mean 'lite'"):
-        cfg.load_preset("litte")
+        load_preset("litte")
     with pytest.raises(InputError, match="no such preset"):
-        cfg.load_preset("../lite")
+        load_preset("../lite")
 
 
 def test_every_field_is_read_somewhere():
     """No setting that nothing reads."""
     from pathlib import Path
 
-    source = "".join(p.read_text() for p in Path(cfg.__file__).parent.rglob("*.py") if p.name != "config.py")
+    modules = Path(config_files.__file__).parent.rglob("*.py")
+    source = "".join(p.read_text() for p in modules if p.name not in ("config.py", "config_files.py"))
 
     def names(node):
         for f in dataclasses.fields(node):
             value = getattr(node, f.name)
             yield from names(value) if dataclasses.is_dataclass(value) else [f.name]
 
-    unread = {n for n in names(cfg.Config()) if f".{n}" not in source}
+    unread = {n for n in names(Config()) if f".{n}" not in source}
     assert not unread

@@ -9,7 +9,7 @@ from fake_graphs import FakeGraphs, Forbidding
 
 from ecslam import field_adam
 from ecslam import kernels as seam
-from ecslam.config import apply_settings, load_preset
+from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.draws import device_draw, shares
 from ecslam.field import create_field

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from ecslam import keyframes, pixels
-from ecslam.config import Config, apply_settings, load_preset
+from ecslam.config import Config
+from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import Prefetch, open_sequence
 from ecslam.keyframes import make_keyframe
 from ecslam.pixels import choose_pixels, feature_points, find_corners

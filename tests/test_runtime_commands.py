@@ -15,7 +15,8 @@ import yaml
 from fake_slam import QUICK, Behaviour, FakeSequence
 from runtime_watch import Watch, running
 
-from ecslam import config as configuration
+from ecslam import config_files
+from ecslam.config import Config
 from ecslam.meshing import MeshingStopped
 from ecslam.messages import (
     Export,
@@ -218,12 +219,12 @@ def test_tune_and_load_preset_reach_the_engine(tmp_path):
     log = (tmp_path / "events.jsonl").read_text()
     assert "mapping.iterations = 40 from frame 3 on" in log
     assert "preset full from frame 4 on" in log
-    assert configuration.load_config(tmp_path / "config.yaml") == made[0].config
+    assert config_files.load_config(tmp_path / "config.yaml") == made[0].config
 
 
 @pytest.mark.parametrize("command", [LoadPreset("live"), Tune("tracking.iterations", 0)])
 def test_what_would_leave_nothing_that_tracks_is_refused_and_the_run_goes_on(tmp_path, command):
-    config = configuration.apply_settings(configuration.load_preset("lite"), ["align.to=none"])
+    config = config_files.apply_settings(config_files.load_preset("lite"), ["align.to=none"])
     with running(tmp_path, config=config, paused_at=3) as (_, watch, made):
         assert "nothing tracks" in watch.ask(command).error
         watch.go(Step(), State.PAUSED)
@@ -239,8 +240,8 @@ def test_a_request_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch)
 
 
 def test_steps_asked_for_while_one_is_at_work_add_up():
-    control = Control(configuration.Config(), lambda _: None, (), ())
-    control.begin(configuration.Config(), "fake", 30)
+    control = Control(Config(), lambda _: None, (), ())
+    control.begin(Config(), "fake", 30)
     for _ in range(3):
         control.submit(Step())
     paused = []
@@ -255,11 +256,11 @@ def test_steps_asked_for_while_one_is_at_work_add_up():
 
 
 def test_a_restart_with_the_same_preset_keeps_the_settings_it_began_with():
-    began = configuration.apply_settings(configuration.load_preset("live"), ["mapping.iterations=12"])
+    began = config_files.apply_settings(config_files.load_preset("live"), ["mapping.iterations=12"])
     control = Control(began, lambda _: None, (), ("live", "full"))
     control.begin(began, "", 30)
     assert control.restart_config(Restart(preset="live"), "").mapping.iterations == 12
-    assert control.restart_config(Restart(preset="full"), "") == configuration.load_preset("full")
+    assert control.restart_config(Restart(preset="full"), "") == config_files.load_preset("full")
 
 
 def test_restart_begins_again_beside_the_first_run(tmp_path):
@@ -302,9 +303,9 @@ def test_what_waits_for_the_run_before_a_restart_is_not_done_to_the_new_one(tmp_
 def test_a_restart_and_a_preset_keep_what_the_layout_asks_for(tmp_path, monkeypatch):
     (tmp_path / "layouts").mkdir()
     (tmp_path / "layouts" / "fake.yaml").write_text("depth_far_m: 2.5\ntracking:\n  rays: 123\n")
-    monkeypatch.setattr(configuration, "config_folder", lambda: tmp_path)
-    monkeypatch.setattr(configuration, "load_preset", lambda name: replace(configuration.Config(), preset=name))
-    monkeypatch.setattr(configuration, "preset_names", lambda: ["lite", "full"])
+    monkeypatch.setattr(config_files, "config_folder", lambda: tmp_path)
+    monkeypatch.setattr(config_files, "load_preset", lambda name: replace(Config(), preset=name))
+    monkeypatch.setattr(config_files, "preset_names", lambda: ["lite", "full"])
     with running(tmp_path / "run", paused_at=2) as (_, watch, made):
         assert watch.ask(LoadPreset("full")).error == ""
         watch.go(Step(), State.PAUSED)

@@ -14,7 +14,7 @@ from fake_slam import QUICK, Behaviour, FakeSequence, circle, maker, open_fake
 from runtime_watch import running
 
 from ecslam.commands import progress_line
-from ecslam.config import load_config, load_preset
+from ecslam.config_files import load_config, load_preset
 from ecslam.evaluation.trajectory import absolute_error
 from ecslam.messages import Notice, State, Stop
 from ecslam.runtime import engine as module

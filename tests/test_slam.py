@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ecslam import tracker
-from ecslam.config import apply_settings, load_preset
+from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.slam import Slam
 from ecslam.types import InputError

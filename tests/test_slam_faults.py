@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ecslam.config import Config, apply_settings, load_preset
+from ecslam.config import Config
+from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.messages import StepReport
 from ecslam.slam import Slam

@@ -5,7 +5,8 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from ecslam.config import Config, load_config, load_preset
+from ecslam.config import Config
+from ecslam.config_files import load_config, load_preset
 from ecslam.messages import (
     Command,
     LoadPreset,

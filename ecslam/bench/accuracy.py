@@ -9,7 +9,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from ..config import Config, apply_settings
+from ..config import Config
+from ..config_files import apply_settings
 from ..datasets import open_sequence, select_frames
 from ..runtime.engine import Engine
 from ..runtime.judge import judge_run

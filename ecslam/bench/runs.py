@@ -12,7 +12,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ..config import Config, for_layout, load_config, load_preset
+from ..config import Config
+from ..config_files import for_layout, load_config, load_preset
 from ..messages import Snapshot
 from ..types import Sequence
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 from enum import Enum, auto
 from time import monotonic
 
-from .. import config as configuration
+from .. import config_files
 from ..config import Config
 from ..messages import (
     Ack,
@@ -176,7 +176,7 @@ class Control:
 
     def _tuned(self, command: LoadPreset | Tune) -> Config:
         if isinstance(command, LoadPreset):
-            other = configuration.for_layout(configuration.load_preset(command.name), self._layout)
+            other = config_files.for_layout(config_files.load_preset(command.name), self._layout)
             return replace(
                 self.config,
                 preset=command.name,
@@ -190,7 +190,7 @@ class Control:
         nested: object = command.value
         for part in reversed(name.split(".")):
             nested = {part: nested}
-        return configuration.apply(self.config, {group: nested}, "tune")
+        return config_files.apply(self.config, {group: nested}, "tune")
 
     def restart_config(self, command: Restart, layout: str) -> Config:
         """The configuration of the run that ``command`` asks for, on a sequence of ``layout``. Raises InputError."""
@@ -202,10 +202,10 @@ class Control:
             raise InputError(f"preset {command.preset!r} is not on offer; there are: {', '.join(self._presets)}")
         wanted = self._started_with
         if command.preset not in (None, wanted.preset):
-            other = configuration.for_layout(configuration.load_preset(command.preset), layout)
+            other = config_files.for_layout(config_files.load_preset(command.preset), layout)
             wanted = replace(other, seed=wanted.seed, schedule=wanted.schedule)
         given = {"seed": command.seed, "schedule": command.schedule}
-        return configuration.apply(wanted, {k: v for k, v in given.items() if v is not None}, "restart")
+        return config_files.apply(wanted, {k: v for k, v in given.items() if v is not None}, "restart")
 
     # ---- for the engine thread ------------------------------------------------------------------------------------
 

@@ -15,8 +15,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from .. import config as configuration
-from .. import datasets
+from .. import config_files, datasets
 from ..config import Config
 from ..messages import Command, Event, Export, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
 from ..types import Frame, FrameError, InputError, Sequence
@@ -91,7 +90,7 @@ class Engine:
         checkpoint = load_checkpoint(folder / "checkpoints")
         if checkpoint.meta["finished"] and (folder / "summary.json").is_file():
             raise InputError(f"{folder}: this run is finished; look at it with: ecslam view {folder}")
-        config = configuration.apply(Config(), checkpoint.meta["config"], str(folder))
+        config = config_files.apply(Config(), checkpoint.meta["config"], str(folder))
         opened = sequence or checkpoint.meta["sequence"]
         return cls(config, opened, folder, frames=checkpoint.meta["frames"], resumed=checkpoint, **options)
 
@@ -105,7 +104,7 @@ class Engine:
     @property
     def presets(self) -> tuple[str, ...]:
         """Names that ``Restart`` and ``LoadPreset`` accept."""
-        return tuple(configuration.preset_names())
+        return tuple(config_files.preset_names())
 
     @property
     def run_folder(self) -> Path:

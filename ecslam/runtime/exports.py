@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-from .. import config as configuration
+from .. import config_files
 from ..evaluation.trajectory_io import format_kitti, format_tum
 from ..meshing import MeshingStopped
 from ..messages import Event, Export, Exported, FramePictures
@@ -63,7 +63,7 @@ def _maker(
         map_ = frozen
         return lambda: mesh_bytes(build_mesh(map_, export.voxel_m, 0, should_stop).mesh, export.format or "ply")
     if export.kind == "config":
-        text = configuration.to_yaml(run.config)
+        text = config_files.to_yaml(run.config)
         return lambda: text
     times, poses = run.timestamps(), run.poses()
     if export.kind == "keyframes":

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import config as configuration
+from .. import config_files
 from ..config import Config
 from ..datasets.check import odd_depth
 from ..datasets.views import in_order, problems
@@ -113,7 +113,7 @@ class Run:
         }
         about |= {name: getattr(s.intrinsics, name) for name in CAMERA}
         self.folder.write("run.json", about)
-        self.folder.write("config.yaml", configuration.to_yaml(self.config))
+        self.folder.write("config.yaml", config_files.to_yaml(self.config))
         if self.truth is not None:
             known = np.isfinite(self.truth).all((1, 2)) & self._in_order
             self.folder.write("groundtruth.txt", format_tum(s.timestamps()[known], self.truth[known]))
@@ -256,7 +256,7 @@ class Run:
     def configure(self, config: Config) -> None:
         """Other tracking and mapping settings from the next frame on; ``config.yaml`` holds the newest ones."""
         self.config = config
-        self.folder.write("config.yaml", configuration.to_yaml(config))
+        self.folder.write("config.yaml", config_files.to_yaml(config))
         if self.slam is not None:
             self.slam.configure(config)
 
@@ -327,7 +327,7 @@ class Run:
         meta = {
             "sequence": self.plan.address,
             "frames": self.plan.frames,
-            "config": configuration.to_dict(self.config),
+            "config": config_files.to_dict(self.config),
             "tally": self.tally.to_json(),
             "finished": finished,
         }
