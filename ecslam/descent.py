@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import AlignSettings, NormalEquations
+from .kernels import AlignSettings, NormalEquations, Rules
 from .pixels import Points
 
-DAMPING = (1e-4, 1e-8, 1e4)  # at first, at least, at most
-SETTLED = 1e-4  # share of the cost that a step must gain to go on
-STILL = (1e-5, 1e-6)  # a smaller step (metres, radians) ends a stage: an accepted one, a refused one
-LEAST_USED = 6
+RULES = Rules(
+    damping=1e-4, least_damping=1e-8, most_damping=1e4, settled=1e-4,
+    still_after_gain=1e-5, still_after_loss=1e-6, least_used=6,
+)  # fmt: skip
 COARSE_STRIDE = 4
 
 
@@ -44,15 +44,15 @@ def descend(
     iterations: int,
 ) -> Alignment:
     """Levenberg-Marquardt from ``guess`` [4, 4] through all ``settings``, at most ``iterations`` steps with each; all
-    stages but the last take every fourth point."""
+    stages but the last take every fourth point. The volumes do the same in kernels."""
     everything, c2w, total, cost = points, guess, 0, 0.0
     for stage in settings:
         points = everything if stage is settings[-1] else everything.every(COARSE_STRIDE)
         total = len(points.local)
         equations = surface.normal_equations(c2w, points, stage)
-        damping = DAMPING[0]
+        damping = RULES.damping
         for _ in range(iterations):
-            if equations.used < LEAST_USED:
+            if equations.used < RULES.least_used:
                 break
             jtj = equations.jtj.numpy()
             move = -np.linalg.solve(jtj + damping * np.diag(jtj.diagonal() + 1e-9), equations.jtr.numpy())
@@ -61,12 +61,12 @@ def descend(
             before, after = objective(equations, total, stage), objective(found, total, stage)
             size = float(np.abs(move).max())
             if after < before:
-                c2w, equations, damping = trial, found, max(damping / 3, DAMPING[1])
-                if before - after < SETTLED * before or size < STILL[0]:
+                c2w, equations, damping = trial, found, max(damping / 3, RULES.least_damping)
+                if before - after < RULES.settled * before or size < RULES.still_after_gain:
                     break
             else:
                 damping *= 10
-                if damping > DAMPING[2] or size < STILL[1]:
+                if damping > RULES.most_damping or size < RULES.still_after_loss:
                     break
         cost = objective(equations, total, stage)
     return Alignment(c2w, cost / max(total, 1))

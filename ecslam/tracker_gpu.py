@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .align import LEAST_KNOWN, stages
 from .config import Config
-from .descent import COARSE_STRIDE, outlier_cost
+from .descent import COARSE_STRIDE, RULES, outlier_cost
 from .field import TsdfField
 from .kernels import LOSS_NAMES, AlignSettings, Backend, RayBatch, fusion_gpu
 from .kernels._gpu_blocks import Blocks
@@ -28,7 +28,7 @@ from .rays import DevicePixels, kernel_weights, make_rays
 from .samples import uniform
 from .tracker import LEAST_POINTS, LEAST_SEEN, TrackResult, descend_rendered
 from .types import Frame, Intrinsics
-from .volume_gpu import RULES, GpuVolume
+from .volume_gpu import GpuVolume
 
 HEADER = 15  # numbers of a result before the loss terms: pose [3, 4], cost, fit, points
 

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .descent import Alignment, descend
-from .kernels import AlignSettings, NormalEquations, fusion
+from .descent import COARSE_STRIDE, RULES, Alignment
+from .kernels import AlignSettings, NormalEquations, fusion, fusion_descent
 from .kernels.graphs import Recorder
 from .pixels import Points
 from .types import Frame, Intrinsics
@@ -98,9 +98,8 @@ class FusedVolume:
     def normal_equations(self, c2w: NDArray[np.float64], points: Points, settings: AlignSettings) -> NormalEquations:
         """Sums for one Gauss-Newton step, as ``kernels.reference.normal_equations`` has them for the learned map."""
         sums = np.zeros(45)
-        numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
         local, light = points.local.numpy(), points.light.numpy()
-        fusion.align_sums(self._blocks, np.ascontiguousarray(c2w), local, light, self.voxel_m, numbers, sums)
+        fusion.align_sums(self._blocks, np.ascontiguousarray(c2w), local, light, self.voxel_m, settings.numbers(), sums)
         upper = np.triu(sums[:36].reshape(6, 6))
         jtj = torch.from_numpy(upper + np.triu(upper, 1).T)
         return NormalEquations(jtj, torch.from_numpy(sums[36:42]), float(sums[42]), int(sums[44]), int(sums[43]))
@@ -109,7 +108,12 @@ class FusedVolume:
         self, points: Points, guess: NDArray[np.float64], settings: Sequence[AlignSettings], iterations: int
     ) -> Alignment:
         """See ``descent.descend``."""
-        return descend(self, points, guess, settings, iterations)
+        local, light, start = points.local.numpy(), points.light.numpy(), np.ascontiguousarray(guess)
+        stages = np.array([stage.numbers() for stage in settings]).reshape(len(settings), -1)
+        c2w, cost = fusion_descent.descend(
+            self._blocks, start, local, light, self.voxel_m, stages, iterations, COARSE_STRIDE, RULES
+        )
+        return Alignment(c2w, cost / max(len(local), 1))
 
 
 def create_volume(

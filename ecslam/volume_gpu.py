@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .descent import COARSE_STRIDE, DAMPING, LEAST_USED, SETTLED, STILL, Alignment
+from .descent import COARSE_STRIDE, RULES, Alignment
 from .kernels import AlignSettings, NormalEquations, fusion_gpu
 from .kernels.fusion import EDGE
 from .kernels.graphs import Recorder
@@ -23,7 +23,6 @@ SLOTS = 1 << 15
 MOST_TAKEN = 0.5
 LEAST_POINTS = 2048
 COPIED = 4096  # blocks at a time
-RULES = fusion_gpu.Rules(*DAMPING, SETTLED, *STILL, LEAST_USED)
 
 
 class GpuVolume:

@@ -20,7 +20,7 @@ from triton.runtime.jit import JITFunction
 from ecslam.config import FieldConfig
 
 torch.cuda.is_available, available = lambda: True, torch.cuda.is_available
-from ecslam.kernels import fusion_gpu, gpu  # noqa: E402
+from ecslam.kernels import Rules, fusion_gpu, gpu  # noqa: E402
 
 torch.cuda.is_available = available
 LAUNCH = JITFunction.run
@@ -70,7 +70,7 @@ def launch_the_volume():
     fusion_gpu.enter(blocks, listed, torch.zeros(7, dtype=torch.int64))
     fusion_gpu.fuse(blocks, listed, depth, color, numbers, 4, 3)
     fusion_gpu.distances(blocks, torch.zeros(7, 3).double())
-    fusion_gpu.descend(blocks, points, start, (ALIGN, ALIGN), 2, 4, fusion_gpu.Rules(1e-4, 1e-8, 1e4, 1e-4, 0, 0, 6))
+    fusion_gpu.descend(blocks, points, start, (ALIGN, ALIGN), 2, 4, Rules(1e-4, 1e-8, 1e4, 1e-4, 0, 0, 6))
 
 
 if __name__ == "__main__":

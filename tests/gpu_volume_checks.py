@@ -17,7 +17,7 @@ from planes import corner, look, pose
 from ecslam import volume_gpu
 from ecslam.align import align, known_points, stages
 from ecslam.config import AlignConfig, Config, FieldConfig, SamplingConfig, TrackingConfig
-from ecslam.descent import descend
+from ecslam.descent import RULES, descend
 from ecslam.field import create_field
 from ecslam.kernels import LOSS_NAMES, fusion_gpu, gpu, poses_gpu, reference
 from ecslam.kernels._gpu_descent import COST, COUNT, DAMPING, DONE, EQUATIONS, ROW, SIZE, step_kernel
@@ -190,7 +190,7 @@ def test_a_descent_that_refuses_steps(iterations):
     mine.load(theirs.state())
     settings = stages(replace(CONFIG, align=replace(CONFIG.align, colour_weight_m=1.0)))[:1]
     points = measured(300)
-    expected = theirs.descend(points, FAR_GUESS, settings, iterations)
+    expected = descend(theirs, points, FAR_GUESS, settings, iterations)
     found = mine.descend(points, FAR_GUESS, settings, iterations)
     same_sums = descend(mine, points, FAR_GUESS, settings, iterations)
     np.testing.assert_allclose(found.c2w, same_sums.c2w, atol=1e-10)
@@ -225,7 +225,7 @@ def test_the_rules_of_a_step(cost, used, damping, size, ended, next_damping, don
     before[:12], before[16:28], before[COUNT.value] = 1.0, 2.0, used
     before[COST.value], before[DAMPING.value], before[SIZE.value], before[DONE.value] = 1.0, damping, size, ended
     there = [t.to(DEVICE) for t in (before, sums, after)]
-    step_kernel[(1,)](*there, (0.1,) * 7, 1, rules=volume_gpu.RULES, first=False)
+    step_kernel[(1,)](*there, (0.1,) * 7, 1, rules=RULES, first=False)
     after = there[2].cpu()
     gain = cost < 1 and not ended
     assert (after[:12] == (2 if gain else 1)).all()
@@ -275,7 +275,7 @@ def test_nothing_waits_for_the_host(monkeypatch):
     depth, color = torch.zeros(36, 48, device="meta"), torch.zeros(36, 48, 3, dtype=torch.uint8, device="meta")
     with Forbidding():
         fusion_gpu.fuse(blocks, listed, depth, color, torch.zeros(19, device="meta"), 4, 3)
-        row = fusion_gpu.descend(blocks, points, start, tuple(stages(CONFIG)), 10, 4, volume_gpu.RULES)
+        row = fusion_gpu.descend(blocks, points, start, tuple(stages(CONFIG)), 10, 4, RULES)
     assert row.shape == start.shape
 
 

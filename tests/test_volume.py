@@ -7,12 +7,13 @@ import pytest
 import torch
 from planes import CAMERA, corner, look, pose
 
-from ecslam import se3, volume
+from ecslam import descent, se3, volume
 from ecslam.align import align, cost_at, known_points, stages
 from ecslam.config import Config
-from ecslam.descent import moved
+from ecslam.descent import RULES, moved
+from ecslam.kernels import fusion_descent
 from ecslam.kernels.graphs import Recorder
-from ecslam.pixels import spread_pixels
+from ecslam.pixels import Points, spread_pixels
 from ecslam.volume import FusedVolume, create_volume
 
 CONFIG = Config(border_px=4)
@@ -140,3 +141,110 @@ def test_moved_is_retract():
     c2w, xi = pose((10, -20, 30), (1, 2, 3)), np.array([0.1, -0.2, 0.3, 0.4, 0.1, -0.9])
     expected = se3.retract(torch.from_numpy(c2w), torch.from_numpy(xi)).numpy()
     np.testing.assert_allclose(moved(c2w, xi), expected, atol=1e-12)
+
+
+TRUE, GUESS, FAR_GUESS = pose((2, 3, -1), (0.02, 0.01, -0.02)), pose((3, 2, 0), (0.05, -0.01, 0.01)), pose((3, -9, 6))
+WALL = [(np.array([0, 0, 1.0]), 1.5)]
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return fused(corner(), [np.eye(4), pose((0, 6, 2)), pose((4, -5, 0))])
+
+
+def noisy(count=2000, planes=None):
+    """The first ``count`` points seen from TRUE, with noise; one in seven is far from any surface."""
+    pixels, rng = measured(planes or corner(), TRUE), np.random.default_rng(3)
+    local = pixels.points() + rng.normal(0, 0.004, (len(pixels.points()), 3)).astype(np.float32)
+    local[3::7] += np.float32(0.4)
+    light = rng.random(len(local), np.float32)
+    return Points(torch.from_numpy(local[:count]), torch.from_numpy(light[:count]))
+
+
+def assert_descends_alike(surface, points, guess, settings, iterations=10):
+    expected = descent.descend(surface, points, guess, settings, iterations)
+    found = surface.descend(points, guess, settings, iterations)
+    np.testing.assert_allclose(found.c2w, expected.c2w, rtol=0, atol=1e-9)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    return found
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.05, 1.0])
+@pytest.mark.parametrize("guess", [GUESS, FAR_GUESS], ids=["near", "far"])
+@pytest.mark.parametrize("count", [0, 1, 5, 6, 23, 24, 25, 333, 2000])
+def test_the_compiled_descent_is_the_readable_one(surface, count, guess, colour):
+    settings = [replace(stage, colour_weight=colour) for stage in stages(CONFIG)]
+    found = assert_descends_alike(surface, noisy(count), guess, settings)
+    assert count < 333 or np.abs(found.c2w - guess).max() > 0.01
+
+
+@pytest.mark.parametrize("iterations", [0, 1, 4, 40])
+@pytest.mark.parametrize("kernels_m", [(0.02,), (0.06, 0.02), (0.2, 0.06, 0.02, 0.01)])
+def test_a_descent_of_any_length(surface, kernels_m, iterations):
+    settings = stages(replace(CONFIG, align=replace(CONFIG.align, kernels_m=kernels_m)))
+    for guess in (TRUE, GUESS, FAR_GUESS):
+        assert_descends_alike(surface, noisy(), guess, settings, iterations)
+    assert len(fusion_descent.descend.signatures) == 1
+
+
+@pytest.mark.parametrize("stride", [1, 3, 500, 5000])
+def test_a_descent_with_any_share_of_the_points(monkeypatch, surface, stride):
+    for module in (descent, volume):
+        monkeypatch.setattr(module, "COARSE_STRIDE", stride)
+    assert_descends_alike(surface, noisy(), GUESS, stages(CONFIG))
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        {"damping": 10.0}, {"least_damping": 1e-2}, {"most_damping": 5e-4}, {"settled": 0.02},
+        {"still_after_gain": 0.03}, {"still_after_loss": 4e-3}, {"least_used": 1700},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_descent_by_other_rules(monkeypatch, surface, rule):
+    settings = [replace(stage, colour_weight=1.0) for stage in stages(CONFIG)]
+    usual = surface.descend(noisy(), FAR_GUESS, settings, 10)
+    for module in (descent, volume):
+        monkeypatch.setattr(module, "RULES", RULES._replace(**rule))
+    found = assert_descends_alike(surface, noisy(), FAR_GUESS, settings)
+    assert np.abs(found.c2w - usual.c2w).max() > 1e-7
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.05])
+def test_a_descent_where_the_surface_leaves_directions_free(colour):
+    found = fused(WALL, [np.eye(4), pose(centre=(0.05, 0, 0))])
+    settings = [replace(stage, colour_weight=colour) for stage in stages(CONFIG)]
+    for guess in (GUESS, pose(centre=(0.04, -0.01, 0.01))):
+        assert_descends_alike(found, noisy(planes=WALL), guess, settings)
+
+
+def test_a_descent_repeats_and_leaves_its_guess_alone(surface):
+    guess, points = GUESS.copy(), noisy()
+    first, second = (align(surface, points, guess, CONFIG) for _ in range(2))
+    np.testing.assert_array_equal(first.c2w, second.c2w)
+    assert first.cost == second.cost
+    np.testing.assert_array_equal(guess, GUESS)
+    assert not np.shares_memory(first.c2w, second.c2w)
+
+
+def test_a_matrix_that_is_not_positive_refuses_the_step(monkeypatch, surface):
+    monkeypatch.setattr(volume, "RULES", RULES._replace(damping=-2.0))
+    points = noisy()
+    found = align(surface, points, GUESS, CONFIG)
+    np.testing.assert_array_equal(found.c2w, GUESS)
+    assert found.cost == pytest.approx(cost_at(surface, points, GUESS, CONFIG))
+
+
+def test_damped_steps():
+    """Law: they solve the damped system."""
+    rng, lower, move = np.random.default_rng(4), np.empty((6, 6)), np.empty(6)
+    for rank, damping in [(9, 0.0), (9, 3.0), (6, 1e-4), (2, 1e-2), (0, 1e-4)]:
+        jacobian, sums = rng.normal(size=(rank, 6)), np.full(45, np.nan)
+        jtj, jtr = jacobian.T @ jacobian, jacobian.T @ rng.normal(size=rank)
+        sums[:36], sums[36:42] = np.where(np.tri(6).T > 0, jtj, np.nan).flat, jtr
+        assert fusion_descent.damped_step.py_func(sums, damping, lower, move)
+        damped = jtj + damping * np.diag(jtj.diagonal() + 1e-9)
+        np.testing.assert_allclose(damped @ move, -jtr, atol=1e-9)
+    for wrong in (0.0, -1.0, np.nan):
+        assert not fusion_descent.damped_step.py_func(np.full(45, wrong), 0.0, lower, move)

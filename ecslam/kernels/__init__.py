@@ -25,6 +25,7 @@ from .types import (
     GridLayout,
     NormalEquations,
     RayBatch,
+    Rules,
     StepResult,
     Weights,
 )
@@ -37,6 +38,7 @@ __all__ = [
     "GridLayout",
     "NormalEquations",
     "RayBatch",
+    "Rules",
     "StepResult",
     "Weights",
     "select",

@@ -6,8 +6,6 @@ its trial pose, so that nothing is changed in place and nothing waits for the ho
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import triton
 import triton.language as tl
 
@@ -20,18 +18,6 @@ COUNT, COST, DAMPING, SIZE, DONE = (tl.constexpr(32 + k) for k in range(5))
 EQUATIONS = tl.constexpr(48)  # [8, 8] at the best pose
 ROW = 112
 WIDTH = tl.constexpr(ROW)
-
-
-class Rules(NamedTuple):
-    """When a step is taken and when a stage ends: see ``descent``."""
-
-    damping: float
-    least_damping: float
-    most_damping: float
-    settled: float
-    still_after_gain: float
-    still_after_loss: float
-    least_used: int
 
 
 @triton.jit

@@ -234,7 +234,7 @@ def normal_equations(
     net, grid = _net(layout, params), _grid(layout)
     threads, *work = _buffers(0, n, CHUNK_POINTS, net.padded)
     sums = np.zeros((-(-n // CHUNK_POINTS), 45))
-    numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
+    numbers = settings.numbers()
     table = _array(params.table).reshape(-1)
     _spread(
         threads,

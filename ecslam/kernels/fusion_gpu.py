@@ -12,13 +12,12 @@ from torch import Tensor
 
 from ._gpu_align import SUMS
 from ._gpu_blocks import CELLS, EMPTY, Blocks, distances_kernel, enter_kernel
-from ._gpu_descent import COST, COUNT, DONE, POSE, ROW, TRIAL, Rules, step_kernel, sums_kernel
+from ._gpu_descent import COST, COUNT, DONE, POSE, ROW, TRIAL, step_kernel, sums_kernel
 from ._gpu_device import beside, processors
 from ._gpu_volume import STRIDE, Listed, View, integrate_kernel, normals_kernel, read_kernel, touch_kernel
-from .types import AlignSettings
+from .types import AlignSettings, Rules
 
 __all__ = [
-    "Rules",
     "allocate",
     "descend",
     "distances",
@@ -119,13 +118,9 @@ def _add_sums(
     stride: int,
 ) -> None:
     sums_kernel[_programs(-(-len(points) // stride), POINTS)](
-        blocks, points, start[COUNT.value :], pose, done, _numbers(settings), sums, stride,
+        blocks, points, start[COUNT.value :], pose, done, settings.numbers(), sums, stride,
         colour=settings.colour_weight > 0, block=POINTS,
     )  # fmt: skip
-
-
-def _numbers(settings: AlignSettings) -> tuple[float, ...]:
-    return tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
 
 
 def sums_at(blocks: Blocks, points: Tensor, start: Tensor, settings: AlignSettings) -> Tensor:
@@ -157,6 +152,6 @@ def descend(
             stage, stride = stages[number], coarse if number + 1 < len(stages) else 1
             pose, done = (state[TRIAL.value :], state[DONE.value :]) if step else (state, start[DONE.value :])
             _add_sums(blocks, points, start, pose, done, stage, into, stride)
-            step_kernel[(1,)](state, into, after, _numbers(stage), stride, rules=rules, first=step == 0, num_warps=1)
+            step_kernel[(1,)](state, into, after, stage.numbers(), stride, rules=rules, first=step == 0, num_warps=1)
             state = after
     return state

@@ -245,7 +245,7 @@ def normal_equations(
     n = points.shape[0]
     sums = torch.zeros(SUMS, dtype=torch.float64, device=points.device)
     if n:
-        numbers = tuple(float(getattr(settings, name)) for name in AlignSettings.__dataclass_fields__)
+        numbers = settings.numbers()
         with beside(points):
             align_kernel[(_blocks(n, ALIGN_BLOCK),)](
                 _field(layout, params), _places(points, c2w), _flat(luminance), numbers, sums,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -122,6 +123,24 @@ class AlignSettings:
     gradient_high: float
     colour_weight: float
     colour_kernel: float
+
+    def numbers(self) -> tuple[float, ...]:
+        """The fields, in order."""
+        return tuple(float(getattr(self, name)) for name in self.__dataclass_fields__)
+
+
+class Rules(NamedTuple):
+    """When a descent takes a step and when a stage of it ends. damping: at first; settled: share of the cost that a
+    step must gain to go on; still_after_gain, still_after_loss: a smaller step (metres, radians) ends a stage, an
+    accepted one or a refused one; least_used: points."""
+
+    damping: float
+    least_damping: float
+    most_damping: float
+    settled: float
+    still_after_gain: float
+    still_after_loss: float
+    least_used: int
 
 
 @dataclass(frozen=True)
