@@ -109,7 +109,7 @@ class FusedVolume:
     ) -> Alignment:
         """See ``descent.descend``."""
         local, light, start = points.local.numpy(), points.light.numpy(), np.ascontiguousarray(guess)
-        stages = np.array([stage.numbers() for stage in settings]).reshape(len(settings), -1)
+        stages = np.array([stage.numbers() for stage in settings])
         c2w, cost = fusion_descent.descend(
             self._blocks, start, local, light, self.voxel_m, stages, iterations, COARSE_STRIDE, RULES
         )
