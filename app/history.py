@@ -29,12 +29,12 @@ class History:
         self.windows[frame] = window
 
     def add_snapshot(self, s: Snapshot) -> None:
-        """Remember a snapshot's frame unless it is known already."""
-        if s.frame not in self._rows:
+        """Remember the frame that a snapshot reports; a replay's reports none, as all are known."""
+        if s.reported is not None:
             figures = {"track_ms": s.track_ms, "map_ms": s.map_ms}
             if s.ate_cm is not None:
                 figures["ate_cm"] = s.ate_cm
-            self.add(s.frame, figures, s.losses, s.window)
+            self.add(s.reported, figures, s.losses, s.window)
 
     def names(self, prefix: str = "loss ") -> list[str]:
         """Names of the series that start with ``prefix``, in the order they first appeared."""

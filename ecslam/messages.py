@@ -118,7 +118,8 @@ class Snapshot:
     trajectory_gt: float64 [N, 4, 4] (NaN where missing) or None. color: uint8 [h, w, 3] of the current frame, small.
     fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, how far the last mapping
     is, or what cannot be shown, else "". map_loss: the objective of the last mapping so far; losses: see
-    ``StepReport``.
+    ``StepReport``. reported: the frame that losses, window and times are of, None before there is one; an earlier one
+    than ``frame`` while that is at work.
     """
 
     state: State
@@ -145,6 +146,7 @@ class Snapshot:
     lost_frames: int
     reason: str = ""
     map_loss: float | None = None
+    reported: int | None = None
 
 
 @dataclass(frozen=True)

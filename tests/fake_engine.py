@@ -217,6 +217,7 @@ class FakeEngine:
              "colour": 0.3 * decay + 0.1},
             21.0 + 3 * np.sin(i), 84.0 + 9 * np.cos(i), 11.2, 14.9,
             float(np.sqrt((error**2).mean())) if self.truth else None, 512.0 + i, self._loops, 0, 0,
+            reported=i,
         )  # fmt: skip
 
     def _obey(self, number, command):

@@ -64,8 +64,8 @@ def test_every_tab_has_a_panel_and_no_two_share_a_place():
 def test_the_last_window_stays_on_the_page_between_two_mappings(engine, page):
     engine.skip_to(9)
     assert until(lambda: page.hub.current is engine.latest())
-    mapped = replace(engine.snapshot(), frame=10, window=(0, 5, 10), map_ms=80.0)
-    for s in (mapped, replace(mapped, frame=11, window=(), map_ms=0.0)):
+    mapped = replace(engine.snapshot(), frame=10, reported=10, window=(0, 5, 10), map_ms=80.0)
+    for s in (mapped, replace(mapped, frame=11, reported=11, window=(), map_ms=0.0)):
         page.hub._take(s)
         assert until(lambda s=s: page.hub.current is not None and page.hub.current.frame == s.frame)
     assert page.hub.current.window == (0, 5, 10)

@@ -13,17 +13,19 @@ import trimesh
 from ecslam_app import server, theme
 from ecslam_app.geometry import best_side, overview, rotation_difference_deg, rotation_to, up_direction
 from ecslam_app.glb import simplify, to_glb, vertex_normals
-from ecslam_app.history import History
+from ecslam_app.history import History, history_of
 from ecslam_app.panels.compare import figures_table
 from ecslam_app.past import Past
 from ecslam_app.record import html_replay
 from ecslam_app.replay import ReplayEngine
-from ecslam_app.runs import load_run
+from ecslam_app.runs import frame_rows, load_run
 
 from ecslam import messages as m
+from ecslam.runtime import engine as live
 from ecslam.runtime.protocol import EngineHandle
 from ecslam.types import InputError, Mesh
 from tests.fake_engine import FakeEngine, room_mesh, walk, write_run
+from tests.fake_slam import QUICK, Behaviour, FakeSequence, maker
 from tests.test_app_security import until
 
 FRAMES = 40
@@ -307,3 +309,21 @@ def test_history_thins_and_fills_gaps():
     assert len(frames) <= 101
     assert np.isnan(ate[frames % 2 == 0]).all()
     assert history.window_at(57) == (50,)
+
+
+def test_a_frame_seen_at_work_is_credited_with_its_own_figures(tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "LONG_STEP_S", 0.0)
+    monkeypatch.setattr(live, "UNWATCHED_PERIOD_S", 0.0)
+    seen, history = [], History()
+
+    def show(s):
+        seen.append((s.frame, s.reported))
+        history.add_snapshot(s)
+
+    make = maker(Behaviour(interrupts=2, pause_s=0.001))
+    live.Engine(QUICK, FakeSequence(8, bad=(6,)), tmp_path / "run", make=make).run(show)
+    assert {(0, None), (5, 4), (5, 5), (6, 5)} <= set(seen)
+    known = history_of(frame_rows(tmp_path / "run"))
+    assert history.windows == known.windows
+    names = ["track_ms", "map_ms", *known.names()]
+    assert np.array_equal(history.series(names), known.series(names))

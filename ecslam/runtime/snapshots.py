@@ -56,4 +56,5 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
         lost_frames=tally.lost,
         reason=reason or (run.last_mapping if state is State.MAPPING else ""),
         map_loss=run.map_loss,
+        reported=report.frame if report else None,
     )
