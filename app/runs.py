@@ -27,7 +27,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Run:
     """A finished run. rows: one dictionary for each frame that was not skipped, as in ``metrics.jsonl``; timestamps and
-    both trajectories go with them. meshes: path by frame."""
+    both trajectories go with them; trajectory_gt: None without the first true pose too, which put the map into its
+    world. meshes: path by frame."""
 
     folder: Path
     summary: dict[str, Any]
@@ -76,6 +77,7 @@ def load_run(folder: Path) -> Run:
     trajectory = _poses_at(folder / "trajectory.txt", timestamps)
     if trajectory is None or np.isnan(trajectory).any():
         trajectory = tracked
+    truth = _poses_at(folder / "groundtruth.txt", timestamps)
     events = [e for e in read_lines(folder / "events.jsonl") if e.get("type") == "loop"]
     return Run(
         folder=folder,
@@ -83,7 +85,7 @@ def load_run(folder: Path) -> Run:
         rows=rows,
         timestamps=timestamps,
         trajectory=trajectory,
-        trajectory_gt=_poses_at(folder / "groundtruth.txt", timestamps),
+        trajectory_gt=truth if truth is not None and np.isfinite(truth[0]).all() else None,
         keyframes=_keyframes(folder, rows, trajectory),
         loops=tuple(_loop_event(e) for e in events),
         meshes=_meshes(folder, int(rows[-1]["frame"])),

@@ -38,8 +38,8 @@ class LoopEvent:
     frame: where it happened. keyframes: frame indices of the old keyframes involved. correction_cm, correction_deg:
     how far the joint optimisation moved the current pose. loss_before, loss_after: weighted mapping loss.
     error_before_cm, error_after_cm, rotation_error_before_deg, rotation_error_after_deg: against ground truth, None
-    without it. trajectory_before: float32 [N, 3] camera centres of all frames so far, before the correction.
-    c2w_before: float64 [4, 4], the current pose before it.
+    without it or where the map lies in a world of its own. trajectory_before: float32 [N, 3] camera centres of all
+    frames so far, before the correction. c2w_before: float64 [4, 4], the current pose before it.
     """
 
     frame: int
@@ -115,7 +115,8 @@ class Snapshot:
     """The whole visible state after a frame. Newest wins; arrays are never written to after they are sent.
 
     trajectory: float64 [n, 4, 4] estimate of frames 0..n-1, in the world of the ground truth where there is one.
-    trajectory_gt: float64 [N, 4, 4] (NaN where missing) or None. color: uint8 [h, w, 3] of the current frame, small.
+    trajectory_gt: float64 [N, 4, 4] (NaN where missing), None without it and where the first pose of the map is not
+    known, as it then lies in a world of its own. color: uint8 [h, w, 3] of the current frame, small.
     fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, how far the last mapping
     is, or what cannot be shown, else "". map_loss: the objective of the last mapping so far; losses: see
     ``StepReport``. reported: the frame that losses, window and times are of, None before there is one; an earlier one

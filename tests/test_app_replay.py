@@ -191,6 +191,16 @@ def test_killed_run_with_a_cut_line_opens(folder, tmp_path):
     assert (run.trajectory_gt, run.loops, run.meshes) == (None, (), {})
 
 
+def test_without_the_first_true_pose_the_truth_is_not_drawn(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "run")
+    truth = tmp_path / "run/groundtruth.txt"
+    lines = truth.read_text().splitlines(keepends=True)
+    truth.write_text("".join(lines[:3] + lines[5:]))
+    assert np.isnan(load_run(tmp_path / "run").trajectory_gt).any()
+    truth.write_text("".join(lines[5:]))
+    assert load_run(tmp_path / "run").trajectory_gt is None
+
+
 @pytest.mark.parametrize("content", [None, "", "not json\n"])
 def test_what_is_no_run_is_a_clear_error(tmp_path, content):
     if content is not None:

@@ -333,6 +333,18 @@ def test_without_a_true_pose_of_the_first_frame_the_surface_is_not_judged(tmp_pa
     assert "the first frame has no true pose" in told[0]
 
 
+@pytest.mark.parametrize("skipped", [(), (0,)])
+def test_the_truth_counts_in_the_map_only_with_the_first_true_pose(tmp_path, skipped):
+    sequence, snapshots = FakeSequence(12, truth=False), []
+    sequence.poses_gt = lambda: np.where(np.arange(12)[:, None, None] == 0, np.nan, circle(12))
+    one = engine(tmp_path, sequence, Behaviour(loop_at=7, empty=skipped))
+    summary = one.run(snapshots.append)
+    (loop,) = snapshots[-1].loops
+    assert summary["ate_rmse_cm"] > 0
+    assert (snapshots[-1].trajectory_gt is None) == (loop.error_after_cm is None) == (not skipped)
+    assert all(s.trajectory_gt is None for s in snapshots if s.frame == 0)
+
+
 def test_frames_without_a_true_pose_are_left_out_of_the_error_and_counted(tmp_path):
     sequence = FakeSequence(12)
     sequence.poses[[2, 7]] = np.nan

@@ -196,7 +196,7 @@ class Run:
         return self.slam
 
     def _with_errors(self, loop: LoopEvent, after: NDArray[np.float64]) -> LoopEvent:
-        truth = None if self.truth is None else self.truth[loop.frame]
+        truth = None if self.truth_in_map is None else self.truth_in_map[loop.frame]
         if truth is None or loop.c2w_before is None or not np.isfinite(truth).all():
             return loop
         before = loop.c2w_before
@@ -288,6 +288,13 @@ class Run:
     def timestamps(self) -> NDArray[np.float64]:
         """[n] seconds of the processed frames."""
         return np.array(self.slam.trajectory.timestamps[: len(self.tally.rows)] if self.slam else [], np.float64)
+
+    @property
+    def truth_in_map(self) -> NDArray[np.float64] | None:
+        """True poses [N, 4, 4] in the world of the map; None where the first processed frame (or that at work) has
+        none, as the map then lies in a world of its own."""
+        first = self.tally.rows[0] if self.tally.rows else max(self.tally.position - 1, 0)
+        return self.truth if self.truth is not None and np.isfinite(self.truth[first]).all() else None
 
     def measure(self) -> None:
         """Bring the ATE up to date."""

@@ -35,7 +35,7 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
         frame=max(tally.position - 1, 0),
         frames_total=len(sequence),
         trajectory=poses[tally.row_of_each_frame()] if len(poses) else poses,
-        trajectory_gt=run.truth,
+        trajectory_gt=run.truth_in_map,
         keyframes=tuple(
             KeyframeView(frame, c2w, run.folder.picture(frame))
             for frame, c2w in zip(frames, keyframe_poses, strict=True)
