@@ -93,20 +93,24 @@ def demo(
     preset: Annotated[str, typer.Option(help="The preset to show.")] = "live",
     device: Device = "auto",
     frames: Frames = "",
-    out: Out = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Run folder; a run in it is replaced. Default: a new one, runs/demo.")
+    ] = None,
     data: Data = None,
     host: Host = "127.0.0.1",
     port: Port = 8080,
     no_browser: NoBrowser = False,
 ) -> None:
     """Run on the built-in studio and show the result."""
+    from . import commands
+
     run(
         "synthetic/studio",
         preset=preset,
         device=device,
         frames=frames,
         headless=headless,
-        out=out or Path("runs/demo"),
+        out=out or commands.unused(Path("runs/demo")),
         data=data,
         host=host,
         port=port,

@@ -348,6 +348,15 @@ def test_the_default_folder_is_a_new_one(tmp_path):
     assert commands.unused(tmp_path / "room-live") == tmp_path / "room-live-2"
 
 
+def test_a_demo_keeps_the_one_before(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("runs/demo").mkdir(parents=True)
+    with mock.patch.object(cli, "run") as run:
+        assert ecslam("demo", "--headless").code == 0
+        assert ecslam("demo", "--headless", "--out", "here").code == 0
+    assert [call.kwargs["out"] for call in run.call_args_list] == [Path("runs/demo-2"), Path("here")]
+
+
 def test_the_installed_command_refuses_without_a_traceback(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "ecslam.cli", "check", str(tmp_path)], capture_output=True, text=True, check=False
