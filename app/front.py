@@ -43,9 +43,10 @@ _construction = threading.Lock()
 
 @dataclass(frozen=True)
 class Door:
-    """Who may come in. names: host names the page may be asked for under; None: any IP address and this machine's."""
+    """Who may come in. names: host names the page may be asked for under; any_address: under any IP address too."""
 
-    names: frozenset[str] | None
+    names: frozenset[str]
+    any_address: bool
     token: str | None
     cookie: str
 
@@ -73,9 +74,7 @@ class Door:
         if not re.fullmatch(r"[\w.-]+(:\d+)?|\[[\da-fA-F:.]+\](:\d+)?", host):
             return False
         name = urlsplit(f"//{host}").hostname or ""
-        if self.names is not None:
-            return name in self.names
-        return _is_address(name) or name in {"localhost", socket.gethostname().lower(), socket.getfqdn().lower()}
+        return name in self.names or (self.any_address and _is_address(name))
 
     def _cookie(self, request: Request) -> str:
         pairs = (part.strip().partition("=") for line in request.headers.get_all("Cookie") for part in line.split(";"))
@@ -90,8 +89,9 @@ def is_loopback(host: str) -> bool:
 def open_viser(listener: socket.socket, host: str, token: str | None, label: str) -> viser.ViserServer:
     """A viser server on ``listener`` behind the checks. Raises RuntimeError if viser cannot be wrapped."""
     port = listener.getsockname()[1]
-    names = None if host in ("0.0.0.0", "::", "") else _LOOPBACK_NAMES | {host.lower()}
-    door = Door(names, token, f"ecslam_{port}")
+    everywhere = host in ("0.0.0.0", "::", "")
+    own_names = (socket.gethostname(), socket.getfqdn()) if everywhere else (host,)
+    door = Door(_LOOPBACK_NAMES | {name.lower() for name in own_names}, everywhere, token, f"ecslam_{port}")
     shell = _Shell(door, listener)
     share_batches()
     with _construction, _serving_through(shell), contextlib.redirect_stdout(io.StringIO()):
