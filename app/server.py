@@ -6,6 +6,7 @@ import secrets
 import socket
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from ecslam.runtime.protocol import EngineHandle
 from ecslam.types import InputError
@@ -22,7 +23,7 @@ SHORTEST_TOKEN = 16
 
 @dataclass(frozen=True)
 class Dashboard:
-    """A running dashboard. url: the address to open, token included. port: where it listens."""
+    """A running dashboard. url: the address to open, token included. host, port: where it listens, as numbers."""
 
     url: str
     host: str
@@ -32,8 +33,10 @@ class Dashboard:
 
     @property
     def ssh_hint(self) -> str:
-        """The command that brings the page to another machine."""
-        return f"ssh -L {self.port}:127.0.0.1:{self.port} <this machine>"
+        """How to bring the page to another machine."""
+        near = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
+        there = urlsplit(self.url)._replace(netloc=f"localhost:{self.port}").geturl()
+        return f"ssh -L {self.port}:{_in_url(near)}:{self.port} <this machine>, then open {there} there"
 
     def close(self) -> None:
         """Close the page; a live engine goes on, a replay ends."""
@@ -67,10 +70,14 @@ def start(
     server = open_viser(listener, host, token, "EC-SLAM")
     hub = Hub(engine, server, dark)
     hub.start()
-    bound = listener.getsockname()[1]
-    shown = "localhost" if host in ("0.0.0.0", "::", "127.0.0.1") else f"[{host}]" if ":" in host else host
+    address, bound = listener.getsockname()[:2]
+    shown = "localhost" if host in ("0.0.0.0", "::", "127.0.0.1") else _in_url(host)
     url = f"http://{shown}:{bound}/" + (f"?token={token}" if token else "")
-    return Dashboard(url, host, bound, hub, engine)
+    return Dashboard(url, address, bound, hub, engine)
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
 
 
 def view(

@@ -34,12 +34,13 @@ from .runtime.runfolder import CAMERA, read_about
 from .runtime.signals import quit_on_signals
 from .types import InputError, Sequence
 
-console = Console()
+console = Console(markup=False)
 FIGURES = (
     "sequence", "preset", "kernels", "frames", "fps_wall", "ate_rmse_cm", "loop_closures", "skipped_frames",
     "lost_frames",
 )  # fmt: skip
 BUILT_IN = ("synthetic/studio", "synthetic/apartment", "synthetic/corridor")
+IN_A_TERMINAL = ("www-browser", "links", "elinks", "lynx", "w3m")
 
 
 def open_sequence(address: str) -> Sequence:
@@ -159,7 +160,7 @@ def run_headless(engine: Engine) -> None:
             if (notice.level != "info" or notice.frame is None) and engine.error is None:
                 named = notice.frame is None or f"{notice.frame}" in notice.text
                 where = "" if named else f"frame {notice.frame}: "
-                bar.console.print(f"{notice.level}: {where}{notice.text}", soft_wrap=True, markup=False)
+                bar.console.print(f"{notice.level}: {where}{notice.text}", soft_wrap=True)
 
         summary = engine.run(show, tell)
     finish_run(engine.run_folder, summary)
@@ -242,7 +243,7 @@ class Reports:
         if s.state is State.FINISHED:
             self._report()
         elif s.state is State.FAILED:
-            console.print(f"error: {s.reason}", soft_wrap=True, markup=False)
+            console.print(f"error: {s.reason}", soft_wrap=True)
 
     def _report(self) -> None:
         folder, summary = self._engine.run_folder, self._engine.summary
@@ -264,20 +265,20 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     try:
         picture = draw_picture(folder)
     except Exception as error:
-        console.print(f"warning: picture.png was not made: {error}", soft_wrap=True, markup=False)
+        console.print(f"warning: picture.png was not made: {error}", soft_wrap=True)
     for name in FIGURES:
         value = summary[name]
         words = "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
-        console.print(f"  {name:15} {words}", soft_wrap=True, markup=False)
+        console.print(f"  {name:15} {words}", soft_wrap=True)
     for name, path in {"mesh": folder / "mesh.ply", "picture": picture, "summary": folder / "summary.json"}.items():
         if path is not None and path.is_file():
-            console.print(f"  {name:15} {path}", soft_wrap=True, markup=False)
+            console.print(f"  {name:15} {path}", soft_wrap=True)
     for note in (summary["kernels_note"], *(f"{name} not saved ({why})" for name, why in summary["not_saved"].items())):
         if note:
-            console.print(f"  note: {note}", soft_wrap=True, markup=False)
+            console.print(f"  note: {note}", soft_wrap=True)
     if not (folder / "mesh.ply").is_file():
         text = f"  no mesh.ply yet: ecslam mesh {folder} makes it, or ecslam resume {folder} goes on with the run"
-        console.print(text, soft_wrap=True, markup=False)
+        console.print(text, soft_wrap=True)
 
 
 def draw_picture(folder: Path) -> Path | None:
@@ -309,7 +310,7 @@ def evaluate(folder: Path) -> None:
     for name, value in figures.items():
         console.print(f"  {name:18} {value:.3f}")
     for note in notes:
-        console.print(f"  note: {note}", soft_wrap=True, markup=False)
+        console.print(f"  note: {note}", soft_wrap=True)
 
 
 def remesh(folder: Path, voxel_m: float, out: Path) -> None:
@@ -360,7 +361,17 @@ def _progress() -> Progress:
 
 def _announce(dashboard: Any, browser: bool, at_the_end: str) -> None:
     console.print(f"Dashboard: {dashboard.url}", soft_wrap=True)
-    console.print(f"From another machine: {dashboard.ssh_hint}, then open the same address there", soft_wrap=True)
+    console.print(f"From another machine: {dashboard.ssh_hint}", soft_wrap=True)
     console.print(f"Ctrl-C ends it; {at_the_end}.")
     if browser:
-        webbrowser.open(dashboard.url)
+        _open(dashboard.url)
+
+
+def _open(url: str) -> None:
+    """Show a page in the person's browser, unless that runs in the terminal, and wait for nothing."""
+    try:
+        shown_by = webbrowser.get()
+    except webbrowser.Error:
+        return
+    if Path(getattr(shown_by, "name", "")).name not in IN_A_TERMINAL:
+        threading.Thread(target=shown_by.open, args=(url,), name="browser", daemon=True).start()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import http.client
+import re
 import socket
 import time
+from urllib.parse import urlsplit
 
 import msgspec
 import pytest
@@ -271,6 +273,36 @@ def test_open_host_always_has_a_token(engine):
         assert get(page)[0].status == 401
         assert get(page, Host="evil.example")[0].status == 403
         assert get(page, page.url.split(str(page.port))[1])[0].status == 303
+    finally:
+        page.close()
+
+
+def test_no_request_waits_for_a_name_server(engine, monkeypatch):
+    monkeypatch.setattr(socket, "getfqdn", lambda: "Here.Example")
+    page = server.start(engine, host="0.0.0.0", port=0)
+    monkeypatch.delattr(socket, "getfqdn")
+    try:
+        for host in ("localhost", "here.example", socket.gethostname(), "192.0.2.1"):
+            assert get(page, Host=host)[0].status == 401
+        assert get(page, Host="there.example")[0].status == 403
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "0.0.0.0", "::1"])
+def test_the_tunnel_leads_to_the_page(engine, host):
+    try:
+        listener = bind(host, 0)
+    except InputError:
+        pytest.skip(f"this machine has no {host}")
+    page = server.start(engine, host=host, listener=listener)
+    try:
+        near, there, port, address = re.match(r"ssh -L (\d+):(.+):(\d+) <.*>, then open (\S+)", page.ssh_hint).groups()
+        assert address.startswith(f"http://localhost:{near}/")
+        with socket.create_connection((there.strip("[]"), int(port)), 5) as tunnel:
+            tunnel.sendall(f"GET {urlsplit(address).path}?{urlsplit(address).query} HTTP/1.1\r\n".encode())
+            tunnel.sendall(f"Host: {urlsplit(address).netloc}\r\n\r\n".encode())
+            assert tunnel.recv(12) in (b"HTTP/1.1 200", b"HTTP/1.1 303")
     finally:
         page.close()
 

@@ -1,7 +1,11 @@
 """What the command line says while the dashboard is up."""
 
+import threading
+import webbrowser
+from types import SimpleNamespace
 from urllib.request import urlopen
 
+import pytest
 from ecslam_app import server
 from fake_slam import Behaviour, FakeSequence
 from runtime_watch import running
@@ -49,3 +53,31 @@ def test_the_port_that_was_found_free_is_the_one_that_the_page_has(tmp_path):
             assert b"EC-SLAM" in answer.read()
         page.close()
     assert page.port == found
+
+
+PAGE = SimpleNamespace(url="http://[fd00::5]:8080/?token=t", ssh_hint="ssh -L 8080:[fd00::5]:8080 <this machine>")
+
+
+def test_addresses_and_paths_in_brackets_are_said_whole(tmp_path, capsys):
+    commands._announce(PAGE, False, "nothing is lost")
+    commands.write_synthetic("synthetic/studio?size=32x24&frames=1", tmp_path / "[raw]", "")
+    said = "".join(capsys.readouterr().out.split())
+    for words in (PAGE.url, PAGE.ssh_hint, str(tmp_path / "[raw]")):
+        assert words.replace(" ", "") in said
+
+
+@pytest.mark.parametrize(("command", "opens"), [("w3m", False), ("lynx", False), ("firefox", True)])
+def test_a_browser_never_holds_up_the_run_nor_takes_the_terminal(tmp_path, monkeypatch, command, opens):
+    began, closed = threading.Event(), threading.Event()
+    browser = webbrowser.GenericBrowser([str(tmp_path / command), "%s"])
+    browser.open = lambda url: began.set() or closed.wait(10)
+    monkeypatch.setattr(webbrowser, "get", lambda: browser)
+    commands._announce(PAGE, True, "nothing is lost")
+    assert began.wait(10 if opens else 0.1) == opens
+    closed.set()
+
+
+def test_without_a_browser_there_is_the_address(monkeypatch, capsys):
+    monkeypatch.setattr(webbrowser, "get", lambda: (_ for _ in ()).throw(webbrowser.Error("none")))
+    commands._announce(PAGE, True, "nothing is lost")
+    assert PAGE.url in capsys.readouterr().out
