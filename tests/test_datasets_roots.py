@@ -1,5 +1,9 @@
 """Which sequences a folder holds, for the dashboard's choice."""
 
+import errno
+import os
+from pathlib import Path
+
 import pytest
 
 from ecslam import commands
@@ -34,6 +38,22 @@ def test_a_sequence_is_its_own_root(root):
 def test_a_root_without_sequences_is_an_error(root, name, says):
     with pytest.raises(InputError, match=says):
         sequences_under(root / name)
+
+
+def test_a_folder_that_cannot_be_read_is_passed_over(tmp_path, monkeypatch):
+    write_replica(open_sequence("synthetic/studio?size=32x24&frames=2"), tmp_path / "room")
+    (tmp_path / "lost+found").mkdir()
+    listed = Path.iterdir
+
+    def guarded(folder):
+        if folder.name == "lost+found":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", guarded)
+    assert sequences_under(tmp_path) == (str(tmp_path / "room"),)
+    with pytest.raises(InputError, match=f"did you mean {tmp_path / 'room'}"):
+        open_sequence(tmp_path)
 
 
 def test_the_dashboard_offers_the_rooms_and_what_the_roots_hold(root):

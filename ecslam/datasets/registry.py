@@ -84,12 +84,20 @@ def _open_folder(folder: Path) -> Sequence:
     layout = _recognise(folder)
     if layout is not None:
         return layout.open(folder)
-    inside = next((p for p in sorted(folder.iterdir())[:100] if p.is_dir() and _recognise(p)), None)
+    inside = next((p for p in sorted(folder.iterdir())[:100] if looks_like_one(p)), None)
     if inside is not None:
         raise InputError(f"{folder}: not a sequence itself; did you mean {inside}?")
     found = ", ".join(names[:4]) + (" ..." if len(names) > 4 else "")
     known = "; ".join(summary(layout) for layout in layouts())
     raise InputError(f"{folder}: no known layout (it holds {found}); rearrange it as one of these: {known}")
+
+
+def looks_like_one(folder: Path) -> bool:
+    """Whether a sequence seems to lie in ``folder``, by file names alone; not where those cannot be read."""
+    try:
+        return folder.is_dir() and _recognise(folder) is not None
+    except OSError:
+        return False
 
 
 def _recognise(folder: Path) -> Layout | None:

@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 from ..types import InputError
-from .registry import layouts
+from .registry import looks_like_one
 
 DEEPEST, MOST_FOLDERS = 3, 2000
 
@@ -22,7 +22,7 @@ def sequences_under(root: Path) -> tuple[str, ...]:
     folder = root.expanduser().resolve()
     if not folder.is_dir():
         raise InputError(f"--data {root}: no such folder; give one that holds sequences")
-    found = tuple(str(each) for each in islice(_folders(folder, DEEPEST), MOST_FOLDERS) if _known(each))
+    found = tuple(str(each) for each in islice(_folders(folder, DEEPEST), MOST_FOLDERS) if looks_like_one(each))
     if not found:
         raise InputError(f"--data {root}: no sequence in it; `ecslam check FOLDER` says what is wrong with one")
     return found
@@ -31,7 +31,7 @@ def sequences_under(root: Path) -> tuple[str, ...]:
 def _folders(folder: Path, deeper: int) -> Iterator[Path]:
     """``folder`` and the folders below it that may hold a sequence; nothing lies inside one."""
     yield folder
-    if deeper == 0 or _known(folder):
+    if deeper == 0 or looks_like_one(folder):
         return
     try:
         inside = sorted(entry.path for entry in os.scandir(folder) if entry.is_dir() and entry.name[0] != ".")
@@ -39,7 +39,3 @@ def _folders(folder: Path, deeper: int) -> Iterator[Path]:
         return
     for path in inside:
         yield from _folders(Path(path), deeper - 1)
-
-
-def _known(folder: Path) -> bool:
-    return any(layout.sniff(folder) for layout in layouts())
