@@ -184,9 +184,12 @@ def synth(
 @app.command()
 def check(sequence: SequenceArgument) -> None:
     """Say what a folder is and what looks odd about it, before a run."""
+    from .datasets import open_sequence
     from .datasets.check import check_sequence, format_report
 
-    typer.echo(format_report(check_sequence(sequence)))
+    opened = open_sequence(sequence)
+    config = resolve_config(None, opened, None, None, None, None)
+    typer.echo(format_report(check_sequence(opened, config=config)))
 
 
 @bench.command(name="kernels")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -117,6 +118,16 @@ def test_check_says_what_looks_odd(sequence, tmp_path):
     report = ecslam("check", broken)
     assert report.code == 0
     assert "depth000002.png" in report.out
+
+
+def test_check_judges_depth_by_what_a_run_with_this_layout_uses(tmp_path):
+    for n in range(2):
+        cv2.imwrite(str(tmp_path / f"frame-{n:06d}.color.png"), np.full((48, 64, 3), 99, np.uint8))
+        cv2.imwrite(str(tmp_path / f"frame-{n:06d}.depth.png"), np.full((48, 64), 5000, np.uint16))
+    (tmp_path / "camera-intrinsics.txt").write_text("60 0 32\n0 60 24\n0 0 1\n")
+    report = ecslam("check", tmp_path).out
+    assert "0.10 .. 3.00 m, 0% of the depth" in report
+    assert "beyond depth_far_m = 3" in report
 
 
 def test_summary_has_the_keys_that_others_rely_on(finished, sequence):

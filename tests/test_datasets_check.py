@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from ecslam.config import Config
 from ecslam.datasets.check import check_sequence, format_report
 from ecslam.types import Frame, FrameError, InputError, Intrinsics, Mesh
 
@@ -99,6 +100,7 @@ def test_a_healthy_recording_is_measured_and_not_odd() -> None:
 SPOILT: list[tuple[str, Callable[[], Recording]]] = [
     ("wrong depth scale", lambda: Recording(depth=np.full((H, W), 0.002, np.float32))),
     ("wrong depth scale", lambda: Recording(depth=np.full((H, W), 50, np.float32))),
+    ("100% of the depth is beyond depth_far_m = 8", lambda: Recording(depth=np.full((H, W), 9, np.float32))),
     ("40 of 40 frames are black", lambda: Recording(color=1)),
     ("40 of 40 frames have no depth", lambda: Recording(depth=np.zeros((H, W), np.float32))),
     (
@@ -123,6 +125,16 @@ def test_each_oddity_is_said_in_the_report_and_its_text(says: str, make: Callabl
     report = check_sequence(make())
     assert any(says in odd for odd in report.odd)
     assert says in format_report(report)
+
+
+def test_what_a_run_would_leave_out_is_measured() -> None:
+    config = Config(depth_near_m=1.5, depth_far_m=2.5)
+    report = check_sequence(Recording(), config=config)
+    assert report.odd == ()
+    assert (report.depth.too_near, report.depth.too_far) == pytest.approx((0.25, 0.25), abs=0.05)
+    assert "1.50 .. 2.50 m" in format_report(report)
+    (odd,) = check_sequence(Recording(), config=Config(depth_near_m=2.5)).odd
+    assert "below depth_near_m = 2.5" in odd
 
 
 def test_missing_poses_are_counted_and_left_out_of_the_path() -> None:

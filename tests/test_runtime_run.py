@@ -308,6 +308,14 @@ def test_what_is_odd_about_a_sequence_is_told_and_kept(tmp_path):
     assert "1 gaps of more than 1 s between frames" in logged
 
 
+def test_depth_that_is_left_out_is_told(tmp_path):
+    sequence = FakeSequence(2)
+    sequence.depth_m = 5.0
+    assert run(tmp_path / "all", sequence)["warnings"] == []
+    (warning,) = run(tmp_path / "none", sequence, config=replace(QUICK, depth_far_m=3.0))["warnings"]
+    assert warning.startswith("frame 0: 100% of the depth is beyond depth_far_m = 3 ")
+
+
 def test_being_lost_is_said_once_and_marks_the_poses(tmp_path):
     summary = run(tmp_path, behaviour=Behaviour(lost=tuple(range(6, 16))))
     assert summary["lost_frames"] == 10

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config import Config
 from ..indices import evenly
 from ..types import Frame, FrameError, Intrinsics, Sequence
 from .prefetch import Prefetch
@@ -18,6 +19,7 @@ from .views import GAP_S, problems
 
 USUAL_DEPTH_M = (0.2, 10.0)
 MOST_WITHOUT_DEPTH = 0.6
+MOST_LEFT_OUT = 0.5
 BLACK = 4.0  # mean colour value
 JUMP_M, JUMP_DEG, JUMP_RATIO = 0.3, 30.0, 10.0
 
@@ -26,7 +28,8 @@ JUMP_M, JUMP_DEG, JUMP_RATIO = 0.3, 30.0, 10.0
 class DepthStats:
     """Of the frames read. low_m, median_m, high_m: 1, 50 and 99 % of the valid depths (NaN when there are none).
 
-    missing: share of pixels without depth. empty: frames without any.
+    missing: share of pixels without depth. empty: frames without any. too_near, too_far: shares of the valid depths
+    that a run leaves out.
     """
 
     low_m: float
@@ -34,6 +37,8 @@ class DepthStats:
     high_m: float
     missing: float
     empty: int
+    too_near: float
+    too_far: float
 
 
 @dataclass(frozen=True)
@@ -63,7 +68,8 @@ class TimeStats:
 class CheckReport:
     """What ``check_sequence`` found. frames_read of ``frames`` were read; unreadable: their messages; black: how many.
 
-    poses: None without ground truth. odd: what a person should look at before a run, in plain words; empty when fine.
+    used_m: the depths that a run uses. poses: None without ground truth. odd: what a person should
+    look at before a run, in plain words; empty when fine.
     """
 
     name: str
@@ -75,17 +81,21 @@ class CheckReport:
     unreadable: tuple[str, ...]
     black: int
     depth: DepthStats
+    used_m: tuple[float, float]
     poses: PoseStats | None
     time: TimeStats
     odd: tuple[str, ...]
 
 
-def check_sequence(sequence: Sequence | str | Path, samples: int = 40) -> CheckReport:
-    """Look a sequence over, reading at most ``samples`` frames spread over it. Raises InputError."""
+def check_sequence(sequence: Sequence | str | Path, samples: int = 40, config: Config | None = None) -> CheckReport:
+    """Look a sequence over for a run with ``config``, reading at most ``samples`` frames spread over it. Raises
+    InputError."""
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
     indices = evenly(len(sequence), samples).tolist()
-    depth, black, unreadable = _read_frames(result for _, result in Prefetch(sequence, indices))
+    config = config or Config()
+    used_m = config.depth_near_m, config.depth_far_m
+    depth, black, unreadable = _read_frames((result for _, result in Prefetch(sequence, indices)), used_m)
     poses = _pose_stats(sequence.poses_gt())
     return CheckReport(
         name=sequence.name,
@@ -97,12 +107,13 @@ def check_sequence(sequence: Sequence | str | Path, samples: int = 40) -> CheckR
         unreadable=unreadable,
         black=black,
         depth=depth,
+        used_m=used_m,
         poses=poses,
         time=_time_stats(sequence.timestamps()),
         odd=(
             *problems(sequence),
             *_odd_camera(sequence.intrinsics),
-            *_odd_images(depth, black, unreadable, len(indices)),
+            *_odd_images(depth, used_m, black, unreadable, len(indices)),
             *_odd_poses(poses),
         ),
     )
@@ -120,6 +131,7 @@ def format_report(report: CheckReport) -> str:
         ),
         ("images", f"{k.width}x{k.height}, fx {k.fx:.1f} fy {k.fy:.1f} cx {k.cx:.1f} cy {k.cy:.1f}{lens}"),
         ("depth", f"{d.low_m:.2f} .. {d.high_m:.2f} m, median {d.median_m:.2f} m, {d.missing:.0%} of pixels without"),
+        ("used", f"{report.used_m[0]:.2f} .. {report.used_m[1]:.2f} m, {1 - d.too_near - d.too_far:.0%} of the depth"),
         ("time", f"{t.duration_s:.1f} s at {t.fps:.1f} frames/s"),
         ("poses", "no ground truth" if p is None else _pose_line(p)),
         *(("unreadable", message) for message in report.unreadable),
@@ -133,7 +145,9 @@ def _pose_line(p: PoseStats) -> str:
     return f"path {p.path_m:.2f} m, largest step {p.max_step_m * 100:.1f} cm and {p.max_step_deg:.1f} degrees{missing}"
 
 
-def _read_frames(results: Iterator[Frame | FrameError]) -> tuple[DepthStats, int, tuple[str, ...]]:
+def _read_frames(
+    results: Iterator[Frame | FrameError], used_m: tuple[float, float]
+) -> tuple[DepthStats, int, tuple[str, ...]]:
     depths: list[NDArray[np.float32]] = []
     missing: list[float] = []
     unreadable: list[str] = []
@@ -149,7 +163,14 @@ def _read_frames(results: Iterator[Frame | FrameError]) -> tuple[DepthStats, int
     pooled = np.concatenate(depths) if depths else np.empty(0, np.float32)
     low, median, high = np.percentile(pooled, [1, 50, 99]).tolist() if len(pooled) else [float("nan")] * 3
     share = float(np.mean(missing)) if missing else 1.0
-    return DepthStats(low, median, high, share, missing.count(1.0)), black, tuple(unreadable)
+    stats = DepthStats(low, median, high, share, missing.count(1.0), *_left_out(pooled, used_m))
+    return stats, black, tuple(unreadable)
+
+
+def _left_out(depths: NDArray[np.float32], used_m: tuple[float, float]) -> tuple[float, float]:
+    """The shares of ``depths`` that are nearer and farther than those that a run uses."""
+    count = max(len(depths), 1)
+    return float((depths < used_m[0]).sum() / count), float((depths > used_m[1]).sum() / count)
 
 
 def _pose_stats(poses: NDArray[np.float64] | None) -> PoseStats | None:
@@ -196,7 +217,9 @@ def _odd_camera(k: Intrinsics) -> Iterator[str]:
         yield f"the camera would see {view_deg:.0f} degrees across: wrong intrinsics?"
 
 
-def _odd_images(depth: DepthStats, black: int, unreadable: tuple[str, ...], tried: int) -> Iterator[str]:
+def _odd_images(
+    depth: DepthStats, used_m: tuple[float, float], black: int, unreadable: tuple[str, ...], tried: int
+) -> Iterator[str]:
     if unreadable:
         yield f"{len(unreadable)} of {tried} frames are unreadable; a run skips them and stops when over 20 % are"
     if black:
@@ -205,21 +228,27 @@ def _odd_images(depth: DepthStats, black: int, unreadable: tuple[str, ...], trie
         yield f"{depth.empty} of {tried} frames have no depth at all"
     if depth.missing > MOST_WITHOUT_DEPTH and len(unreadable) < tried:
         yield f"{depth.missing:.0%} of the pixels have no depth"
-    if depth.median_m < USUAL_DEPTH_M[0] or depth.median_m > USUAL_DEPTH_M[1]:
-        yield _odd_median(depth.median_m)
+    if odd := _odd_distance(depth.median_m, depth.too_near, depth.too_far, used_m):
+        yield odd
 
 
-def odd_depth(depth: NDArray[np.float32]) -> str:
-    """What is odd about a frame's depth [H, W] in metres as a whole, or "": no depth, or hardly a room's."""
+def odd_depth(depth: NDArray[np.float32], used_m: tuple[float, float]) -> str:
+    """What is odd about a frame's depth [H, W] in metres as a whole, or "": none, hardly a room's, or hardly any of it
+    within ``used_m``."""
     known = depth[::4, ::4][np.isfinite(depth[::4, ::4]) & (depth[::4, ::4] > 0)]
     if not len(known):
         return "no depth at all"
-    median_m = float(np.median(known))
-    return "" if USUAL_DEPTH_M[0] <= median_m <= USUAL_DEPTH_M[1] else _odd_median(median_m)
+    return _odd_distance(float(np.median(known)), *_left_out(known, used_m), used_m)
 
 
-def _odd_median(median_m: float) -> str:
-    return f"the median depth is {median_m:.3g} m: probably a wrong depth scale"
+def _odd_distance(median_m: float, too_near: float, too_far: float, used_m: tuple[float, float]) -> str:
+    if median_m < USUAL_DEPTH_M[0] or median_m > USUAL_DEPTH_M[1]:
+        return f"the median depth is {median_m:.3g} m: probably a wrong depth scale"
+    if too_near > MOST_LEFT_OUT:
+        return f"{too_near:.0%} of the depth is below depth_near_m = {used_m[0]:g} and left out: lower that with --set"
+    if too_far > MOST_LEFT_OUT:
+        return f"{too_far:.0%} of the depth is beyond depth_far_m = {used_m[1]:g} and left out: raise that with --set"
+    return ""
 
 
 def _odd_poses(poses: PoseStats | None) -> Iterator[str]:

@@ -157,8 +157,10 @@ class Run:
         if not self._in_order[index]:
             self._skip(index, f"frame {index} is not in the order of time ({item.timestamp:.6f} s)")
             return None
-        if self._color is None and (odd := odd_depth(item.depth)):
-            self.warn(odd, index)
+        if self._color is None:
+            used_m = self.config.depth_near_m, self.config.depth_far_m
+            if odd := odd_depth(item.depth, used_m):
+                self.warn(odd, index)
         self._color = item.color
         try:
             report = self._step(item, interrupt)
