@@ -52,7 +52,7 @@ class ReplayEngine:
     def __init__(self, run: Run, others: tuple[Run, ...] = ()) -> None:
         self.run, self.others = run, others
         self.run_folder = run.folder
-        self.sequences = (str(run.summary.get("sequence", run.name)),)
+        self.sequences = (run.sequence or run.name,)
         self.history = history_of(run.rows)
         self._past = Past(run.rows, run.trajectory)
         self._rows = np.array([run.row_at(frame) for frame in range(run.last + 1)])
@@ -105,8 +105,8 @@ class ReplayEngine:
             error = ""
             try:
                 self._obey(*item)
-            except (InputError, OSError) as problem:
-                error = str(problem)
+            except Exception as problem:
+                error = str(problem) or type(problem).__name__
             self._feed.publish(Ack(*item, error))
 
     def _obey(self, number: int, command: Command) -> None:

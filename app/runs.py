@@ -26,11 +26,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run. rows: one dictionary for each frame that was not skipped, as in ``metrics.jsonl``; timestamps and
-    both trajectories go with them; trajectory_gt: None without the first true pose too, which put the map into its
-    world. meshes: path by frame."""
+    """A finished run. sequence: its name, "" where that is not on record. rows: one dictionary for each frame that was
+    not skipped, as in ``metrics.jsonl``; timestamps and both trajectories go with them; trajectory_gt: None without the
+    first true pose too, which put the map into its world. meshes: path by frame."""
 
     folder: Path
+    sequence: str
     summary: dict[str, Any]
     rows: tuple[dict[str, Any], ...]
     timestamps: Array
@@ -70,7 +71,7 @@ def load_run(folder: Path) -> Run:
     if not rows:
         raise InputError(f"{folder / 'metrics.jsonl'}: holds no frame; the run ended before its first one")
     summary = _json(folder / "summary.json")
-    camera = {"width": 640, "height": 480, "fy": 500.0, **_json(folder / "run.json")}
+    about = {"width": 640, "height": 480, "fy": 500.0, **_json(folder / "run.json")}
     timestamps = np.array([float(row.get("timestamp", row["frame"])) for row in rows])
     tracked = np.tile(np.eye(4), (len(rows), 1, 1))
     tracked[:, :3] = np.array([row["c2w"][:12] for row in rows], float).reshape(-1, 3, 4)
@@ -81,6 +82,7 @@ def load_run(folder: Path) -> Run:
     events = [e for e in read_lines(folder / "events.jsonl") if e.get("type") == "loop"]
     return Run(
         folder=folder,
+        sequence=str(summary.get("sequence") or about.get("name") or ""),
         summary=summary,
         rows=rows,
         timestamps=timestamps,
@@ -89,8 +91,8 @@ def load_run(folder: Path) -> Run:
         keyframes=_keyframes(folder, rows, trajectory),
         loops=tuple(_loop_event(e) for e in events),
         meshes=_meshes(folder, int(rows[-1]["frame"])),
-        fov_y_rad=float(2 * np.arctan(camera["height"] / 2 / camera["fy"])),
-        aspect=float(camera["width"] / camera["height"]),
+        fov_y_rad=float(2 * np.arctan(about["height"] / 2 / about["fy"])),
+        aspect=float(about["width"] / about["height"]),
     )
 
 

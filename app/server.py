@@ -87,7 +87,7 @@ def view(
     if not 1 <= len(runs) <= 2:
         raise InputError("view takes one run folder, or two to compare")
     loaded = [load_run(folder) for folder in runs]
-    names = {str(run.summary.get("sequence", "")) for run in loaded}
+    names = {run.sequence for run in loaded if run.sequence}
     if len(names) > 1:
         raise InputError(
             f"{runs[0]} and {runs[1]}: runs on different sequences ({', '.join(sorted(names))}) cannot be compared"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import zipfile
 
@@ -22,6 +23,7 @@ from ecslam_app.runs import frame_rows, load_run
 
 from ecslam import messages as m
 from ecslam.runtime import engine as live
+from ecslam.runtime.exports import zip_run
 from ecslam.runtime.protocol import EngineHandle
 from ecslam.types import InputError, Mesh
 from tests.fake_engine import FakeEngine, room_mesh, walk, write_run
@@ -221,6 +223,32 @@ def test_runs_on_different_sequences_are_not_compared(folder, tmp_path):
     (other / "summary.json").write_text(json.dumps({"sequence": "synthetic/corridor"}))
     with pytest.raises(InputError, match="different sequences"):
         server.view([folder, other], port=0)
+
+
+def test_a_killed_run_is_compared_by_what_was_written_when_it_began(folder, tmp_path):
+    killed = write_run(tmp_path / "killed", 20)
+    (killed / "summary.json").unlink()
+    (killed / "run.json").write_text(json.dumps({"name": "synthetic/studio"}))
+    page = server.view([killed, folder], port=0)
+    page.close()
+    assert page.engine.sequences == ("synthetic/studio",)
+    (killed / "run.json").write_text(json.dumps({"name": "synthetic/corridor"}))
+    with pytest.raises(InputError, match="different sequences"):
+        server.view([folder, killed], port=0)
+
+
+def test_an_export_that_fails_is_answered_and_the_replay_goes_on(replay, monkeypatch):
+    monkeypatch.setattr("ecslam_app.replay.export", lambda run, command: 1 / 0)
+    assert events(replay, m.Exported, m.Export("config"))[1].error == "division by zero"
+    events(replay, m.Snapshot, m.RunTo(3))
+    assert replay.latest().frame == 3
+
+
+def test_files_older_than_zip_knows_are_exported_too(folder, tmp_path):
+    run = shutil.copytree(folder, tmp_path / "run")
+    os.utime(run / "config.yaml", (0, 0))
+    with zipfile.ZipFile(zip_run(run, "exports/run.zip")) as archive:
+        assert "run/config.yaml" in archive.namelist()
 
 
 def test_html_replay_is_one_file_without_addresses_of_others(replay, tmp_path):

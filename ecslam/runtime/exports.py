@@ -78,7 +78,8 @@ def zip_run(folder: Path, name: str) -> Path:
     path.parent.mkdir(exist_ok=True)
     temporary = path.with_suffix(".tmp")
     try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        deflated = zipfile.ZIP_DEFLATED
+        with zipfile.ZipFile(temporary, "w", deflated, compresslevel=1, strict_timestamps=False) as archive:
             for file in sorted(folder.rglob("*")):
                 inside = file.relative_to(folder)
                 if file.is_file() and inside.parts[0] not in LEFT_OUT_OF_ZIP and not file.name.startswith("."):
