@@ -107,6 +107,15 @@ def make_thumbnail(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     return flat / np.float32(max(float(np.linalg.norm(flat)), 1e-6))
 
 
+def surface_points(keyframes: list[Keyframe], poses: NDArray[np.float64], limit: int) -> NDArray[np.float32]:
+    """Measured points [N, 3] of keyframes in the world, given their poses [K, 4, 4]: about ``limit`` of them where
+    there are more."""
+    stride = max(1, -(-sum(map(len, keyframes)) // limit))
+    thinned = [k.pixels.take(np.arange(0, len(k), stride)) for k in keyframes]
+    parts = [pixels.in_world(pose) for pixels, pose in zip(thinned, poses, strict=True)]
+    return np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
+
+
 def most_similar(keyframes: list[Keyframe], thumbnail: NDArray[np.float32], count: int) -> list[int]:
     """Indices of the ``count`` keyframes that look most like ``thumbnail``, best first."""
     score = np.stack([k.thumbnail for k in keyframes]) @ thumbnail

@@ -40,6 +40,10 @@ class Pixels:
         z = self.depth[has, None]
         return np.concatenate([self.direction[has] * z, z], 1)
 
+    def in_world(self, c2w: NDArray[np.float64]) -> NDArray[np.float32]:
+        """``points`` [M, 3] in the world, seen from c2w [4, 4]."""
+        return (self.points() @ c2w[:3, :3].T + c2w[:3, 3]).astype(np.float32)
+
     def take(self, index: NDArray[np.integer]) -> Pixels:
         """The pixels at ``index``."""
         return Pixels(self.direction[index], self.depth[index], self.color[index], self.feature[index])

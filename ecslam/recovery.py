@@ -10,8 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from .align import Surface
+from .config import Config
+from .pixels import Pixels
 from .se3 import retract, rotation_angle_deg
-from .tracker import TrackResult
+from .tracker import TrackResult, track_direct
 
 LOST_FIT = 0.25
 LOST_SHARE, FOUND_SHARE = 0.6, 0.92  # of the usual fit: a wrong place can be made to explain 85 % of it
@@ -23,6 +25,7 @@ MAX_TURN_DEG = 35.0
 SEARCH_POINTS, SEARCH_POSES, SEARCH_KEPT, SEARCH_FOUND, SEARCH_ROUNDS = 300, 600, 30, 3, 5
 SEARCH_M, SEARCH_RAD = 0.2, 0.25
 AROUND_M, AROUND_RAD = 0.1, 0.1
+RELOCALISE_KERNELS_M, RELOCALISE_ITERATIONS = (0.2, 0.06, 0.02), 20
 
 
 class Recovery:
@@ -61,6 +64,15 @@ class Recovery:
         step = float(np.linalg.norm(track.c2w[:3, 3] - last[:3, 3]))
         return step < MAX_STEP_M and float(rotation_angle_deg(last, track.c2w)) < MAX_TURN_DEG
 
+    def state(self) -> NDArray[np.float64]:
+        """Three numbers, for a checkpoint."""
+        return np.array([self.lost, self.misses, self.usual_fit])
+
+    def load(self, state: NDArray[np.float64]) -> None:
+        """Go on from what ``state`` gave."""
+        lost, misses, usual_fit = state
+        self.lost, self.misses, self.usual_fit = bool(lost), int(misses), float(usual_fit)
+
 
 def around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """The pose [4, 4] and those a step or a turn away along each axis: where to look for a camera after a gap."""
@@ -74,6 +86,16 @@ def best_start(
 ) -> TrackResult:
     """Track from every start pose [4, 4] and keep the result that the map explains best."""
     return max((track(start) for start in starts), key=lambda result: result.fit)
+
+
+def relocalise(
+    surface: Surface, measured: Pixels, starts: NDArray[np.float64], config: Config, rng: np.random.Generator
+) -> TrackResult:
+    """Direct alignment with a wide basin from ``starts`` [S, 4, 4] and the poses that a search around these finds."""
+    align = replace(config.align, kernels_m=RELOCALISE_KERNELS_M, iterations=RELOCALISE_ITERATIONS)
+    found = search(surface, measured.points(), starts, config.truncation_m, rng)
+    wide = replace(config, align=align)
+    return best_start(lambda start: track_direct(surface, measured, start, wide), [*starts, *found])
 
 
 def search(

@@ -16,36 +16,34 @@ import torch
 from numpy.typing import NDArray
 
 from . import kernels as seam
-from .align import LearnedSurface, Surface
 from .config import Config
-from .field import TsdfField, box_of_points, create_field
+from .field import TsdfField, create_field
+from .following import Follower
 from .indices import evenly
 from .kernels.graphs import Recorder
-from .keyframes import Keyframe, Shelf, make_keyframe, make_thumbnail, most_similar
+from .keyframes import Keyframe, Shelf, make_keyframe, surface_points
 from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
-from .observed import ObservedVoxels
-from .observed_gpu import ObservedTable
-from .pixels import Pixels, spread_pixels
-from .recovery import Recovery, around, best_start, search
-from .samples import seeded
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
-from .tracker import LEAST_POINTS, HostTracker, Tracker, TrackResult, track_direct
+from .scene_box import SceneBox
 from .trajectory import Trajectory
 from .types import Frame, FrameError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
-from .volume import FusedVolume, create_volume
 from .window import random_window, select_window
 
 Interrupt = Callable[[], None]
 LEAST_SHARE = 0.1
-RELOCALISE_FROM = 5
-GAP_S = 1.0
-OUTSIDE_SHARE = 0.01
-BOX_POINTS = 8192  # of a keyframe, looked at to see whether the box holds them
-RELOCALISE_KERNELS_M = (0.2, 0.06, 0.02)
 SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A mapping that is done. window: rows [W] of the keyframes that took part. took_s: seconds."""
+
+    window: NDArray[np.int64]
+    result: MapResult
+    took_s: float
 
 
 @dataclass(frozen=True)
@@ -74,41 +72,24 @@ class Slam:
         frame, the identity when None; it stays fixed."""
         self.config, self.intrinsics = config, intrinsics
         self.device = device or torch.device("cpu")
-        self._on_cpu = self.device.type == "cpu"
         self.kernels_name, self._kernels, self.kernels_note = seam.select(self.device)
-        self._recorder = self._new_recorder()
         self.trajectory = Trajectory()
         self.keyframes: list[Keyframe] = []
         self._shelf = Shelf()
         self.mapper: Mapper | None = None
         self._first_pose = np.eye(4) if first_pose is None else np.array(first_pose, np.float64)
-        box = config.field.box
-        self._bounds = bounds if box is None else np.array(box, np.float64).reshape(2, 3)
+        self._box = SceneBox(config.field, bounds)
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
-        lengths, fused = (config.align.voxel_m, config.truncation_m), config.align.to == "fused"
-        self._volume = create_volume(self.kernels_name, *lengths, self.device, self._recorder) if fused else None
-        self._observed: ObservedVoxels | ObservedTable = ObservedVoxels()
-        self._gpu_tracker: Tracker | None = None
-        if self.kernels_name == "gpu" and fused:
-            self._observed, self._gpu_tracker = self._on_gpu()
-        self._trained = 0
-        self._loops, self._recovery = LoopDetector(), Recovery()
+        self._follower = Follower(
+            config, intrinsics, self.device, self.kernels_name, self._kernels, self._rng, self._generator
+        )
+        self._loops = LoopDetector()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
-        self._pending: Future[tuple[MapResult, float]] | None = None
+        self._pending: Future[Mapped] | None = None
         self._landed = Landed()
-        self._window: NDArray[np.int64] = np.empty(0, np.int64)
         self._frozen: TsdfField | None = None
-        self._note, self._outside, self._graphs_failed = "", 0.0, False
-
-    def _on_gpu(self) -> tuple[ObservedTable, Tracker]:
-        from .tracker_gpu import GpuTracker
-
-        assert not isinstance(self._volume, FusedVolume | None)
-        observed = ObservedTable(self.device)
-        generator = seeded(self._rng, self.device)
-        follow = GpuTracker(self.intrinsics, self._volume, observed, self._kernels, generator, self._recorder)
-        return observed, follow
+        self._note, self._graphs_failed = "", False
 
     # ---- one frame --------------------------------------------------------------------------------------------------
 
@@ -118,12 +99,12 @@ class Slam:
             return self._first_frame(frame, interrupt)
         started = time.perf_counter()
         self._apply_pending(block=False)
-        track = self._track(frame)
-        index, lost = len(self.trajectory), self._recovery.lost
-        keyframe = index % self.config.keyframe_every == 0 and not self._recovery.missed
+        track = self._follower.follow(frame, self.trajectory, self.keyframes, self._require_field(), self.config)
+        index, recovery = len(self.trajectory), self._follower.recovery
+        keyframe = index % self.config.keyframe_every == 0 and not recovery.missed
         self.trajectory.append(track.c2w, frame.timestamp, keyframe)
-        if not self._recovery.missed:
-            self._fuse(frame)
+        if not recovery.missed:
+            self._follower.fuse(frame, self.trajectory[-1], self.config)
         tracked, loop, waited_s = time.perf_counter(), None, 0.0
         if keyframe:
             keyframe_now = make_keyframe(frame, self.intrinsics, self.config)
@@ -136,15 +117,15 @@ class Slam:
             frame=frame.index,
             timestamp=frame.timestamp,
             c2w=self.trajectory[-1],
-            tracked=not self._recovery.missed,
-            lost=lost,
+            tracked=not recovery.missed,
+            lost=recovery.lost,
             is_keyframe=keyframe,
             window=landed.window,
             losses=track.losses if landed.losses is None else landed.losses,
             track_ms=1e3 * (tracked - started),
             map_ms=1e3 * (time.perf_counter() - tracked - waited_s + landed.beside_s),
             loop=loop,
-            note=self._recovery.note or self._take_note(),
+            note=recovery.note or self._take_note(),
         )
 
     def _first_frame(self, frame: Frame, interrupt: Interrupt | None) -> StepReport:
@@ -155,24 +136,21 @@ class Slam:
             raise FrameError(
                 f"frame {frame.index}: {share:.1%} of it has usable depth, too little to start the map with"
             )
-        box = self._bounds
-        if box is None:
-            box = box_of_points(_world(keyframe.pixels, self._first_pose), self.config.field.box_margin_m)
+        box = self._box.first(keyframe.pixels, self._first_pose)
         field = create_field(self.config.field, box, self.config.seed, self.device)
         self.mapper = Mapper(field, self._kernels, self.config.seed, self._new_recorder())
         self._frozen = field
         self.trajectory.append(self._first_pose, frame.timestamp, keyframe=True)
         self.keyframes.append(self._shelf.keep(keyframe))
-        self._window = np.array([0])
         try:
-            result = self._optimise(np.array([0]), self.config.mapping.first_iterations, interrupt)
+            mapped = self._optimise(np.array([0]), self.config.mapping.first_iterations, interrupt)
         except BaseException:
             self.mapper = self._frozen = None
             self.trajectory, self.keyframes = Trajectory(), []
             raise
-        self._apply(result)
+        self._apply(mapped)
         self._landed = Landed()
-        self._fuse(frame)
+        self._follower.fuse(frame, self.trajectory[-1], self.config)
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,
@@ -181,7 +159,7 @@ class Slam:
             lost=False,
             is_keyframe=True,
             window=(frame.index,),
-            losses=result.losses,
+            losses=mapped.result.losses,
             track_ms=0.0,
             map_ms=1e3 * (time.perf_counter() - started),
         )
@@ -194,9 +172,8 @@ class Slam:
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
-        if self.mapper is not None and not self._recovery.lost:
-            self._window = self._choose_window()
-            self._apply(self._optimise(self._window, self.config.mapping.iterations, interrupt, smooth=True))
+        if self.mapper is not None and not self._follower.recovery.lost:
+            self._apply(self._optimise(self._choose_window(), self.config.mapping.iterations, interrupt, smooth=True))
             self._settle(interrupt)
 
     def _settle(self, interrupt: Interrupt | None) -> None:
@@ -208,92 +185,33 @@ class Slam:
         fixed, config = np.ones(len(rows), bool), replace(self.config, mapping=mapping)
         self.mapper.run(views, poses, fixed, mapping.final_iterations, config, interrupt, settle=True)
 
-    # ---- tracking ---------------------------------------------------------------------------------------------------
-
-    def _track(self, frame: Frame) -> TrackResult:
-        """Constant-velocity start, the preset's tracker, and recovery when the map does not explain the frame."""
-        gap = frame.timestamp - self.trajectory.timestamps[-1] > GAP_S
-        guess = self.trajectory[-1] if self._recovery.lost or gap else self.trajectory.predict()
-        field, config, tracker = self._require_field(), self.config, self._tracker()
-        track = best_start(lambda start: tracker.track(frame, start, field, config), around(guess) if gap else [guess])
-        return self._recovery.judge(track, self.trajectory[-1], lambda: self._relocalise(frame))
-
-    def _tracker(self) -> Tracker:
-        if self.config.tracking.iterations > 0:
-            self._see()
-        if self._gpu_tracker is not None:
-            return self._gpu_tracker
-        assert isinstance(self._observed, ObservedVoxels)
-        generator = self._generator if self._on_cpu else None
-        return HostTracker(
-            self.intrinsics, self._surface(), self._observed, self._kernels, self._rng, generator, self._recorder
-        )
-
-    def _see(self) -> None:
-        """Bring up to date where the map has been observed."""
-        for view in range(self._observed.views, self._trained):
-            pose = self.trajectory.keyframe_poses()[view]
-            self._observed.add(self.keyframes[view].pixels.points(), pose)
-
-    def _surface(self) -> Surface:
-        return self._volume if self._volume is not None else self._learned()
-
-    def _learned(self) -> LearnedSurface:
-        self._see()
-        assert isinstance(self._observed, ObservedVoxels)
-        return LearnedSurface(self._require_field(), self._kernels, self.config.truncation_m, self._observed)
-
-    def _fuse(self, frame: Frame) -> None:
-        if self._volume is not None:
-            near, far = self.config.depth_near_m, self.config.depth_far_m
-            self._volume.integrate(frame, self.intrinsics, self.trajectory[-1], near, far)
-
-    def _relocalise(self, frame: Frame) -> TrackResult | None:
-        """Direct alignment with a wide basin from the last pose, the keyframes that look most alike, and the poses that
-        a search around these finds; None where hardly anything is measured."""
-        measured = spread_pixels(frame, self.intrinsics, self.config.align.points, self.config, self._rng)
-        if len(measured.points()) < LEAST_POINTS:
-            return None
-        poses, surface = self.trajectory.keyframe_poses(), self._surface()
-        alike = most_similar(self.keyframes, make_thumbnail(frame.color), RELOCALISE_FROM)
-        wide = replace(self.config, align=replace(self.config.align, kernels_m=RELOCALISE_KERNELS_M, iterations=20))
-        starts = np.stack([self.trajectory[-1], *(poses[i] for i in alike)])
-        rng = np.random.default_rng([self.config.seed, frame.index])
-        found = search(surface, measured.points(), starts, self.config.truncation_m, rng)
-        return best_start(lambda start: track_direct(surface, measured, start, wide), [*starts, *found])
-
     # ---- mapping ----------------------------------------------------------------------------------------------------
 
     def _map(self, frame: int, interrupt: Interrupt | None) -> LoopEvent | None:
         """Window, joint optimisation, and an event when old keyframes come back. In ``overlap`` the optimisation runs
         on while tracking goes on, except when a loop closes."""
-        self._grow_box()
-        self._window = self._choose_window()
+        self._check_box()
+        window, iterations = self._choose_window(), self.config.mapping.iterations
         old = self._loops.update(self.trajectory.keyframe_poses(), self.trajectory[-1])
         if self._pool is not None and len(old) == 0:
-            self._pending = self._pool.submit(self._optimise_beside, self._window, self.config.mapping.iterations)
+            self._pending = self._pool.submit(self._optimise, window, iterations, None)
             return None
         centres, before = self.trajectory.poses()[:, :3, 3].astype(np.float32), self.trajectory[-1]
-        result = self._optimise(self._window, self.config.mapping.iterations, interrupt)
-        self._apply(result)
+        mapped = self._optimise(window, iterations, interrupt)
+        self._apply(mapped)
         if len(old) == 0:
             return None
-        met, after = tuple(self.keyframes[i].frame for i in old), sum(result.losses.values())
+        met, result = tuple(self.keyframes[i].frame for i in old), mapped.result
+        after = sum(result.losses.values())
         return loop_event(frame, met, before, self.trajectory[-1], result.loss_first, after, centres)
 
-    def _optimise_beside(self, window: NDArray[np.int64], iterations: int) -> tuple[MapResult, float]:
-        """``_optimise`` on the second thread, and the seconds that it took."""
-        began = time.perf_counter()
-        result = self._optimise(window, iterations, None)
-        return result, time.perf_counter() - began
-
-    def _optimise(
-        self, window: NDArray[np.int64], iterations: int, interrupt: Interrupt | None, smooth: bool = False
-    ) -> MapResult:
+    def _check_box(self) -> None:
         assert self.mapper is not None
-        views = [self.keyframes[i].pixels for i in window]
-        poses = self.trajectory.keyframe_poses()[window]
-        return self.mapper.run(views, poses, window == 0, iterations, self.config, interrupt, smooth)
+        box, pixels = self.mapper.field.layout.box.numpy(), self.keyframes[-1].pixels
+        more, note = self._box.check(box, pixels, self.trajectory[-1])
+        if more is not None:
+            self.mapper.grow(more)
+        self._note = note or self._note
 
     def _choose_window(self) -> NDArray[np.int64]:
         poses, rays = self.trajectory.keyframe_poses(), self.config.mapping.rays
@@ -301,26 +219,25 @@ class Slam:
             return select_window(poses, poses[-1], rays, self.config.window)
         return random_window(len(poses), rays, self.config.window, self._rng)
 
-    def _take_note(self) -> str:
-        note, self._note = self._note, ""
-        for recorder in (self._recorder, self.mapper.recorder if self.mapper else self._recorder):
-            if recorder.failure and not self._graphs_failed:
-                self._graphs_failed, note = True, note or recorder.failure
-        return note
+    def _optimise(
+        self, window: NDArray[np.int64], iterations: int, interrupt: Interrupt | None, smooth: bool = False
+    ) -> Mapped:
+        assert self.mapper is not None
+        began = time.perf_counter()
+        views = [self.keyframes[i].pixels for i in window]
+        poses = self.trajectory.keyframe_poses()[window]
+        result = self.mapper.run(views, poses, window == 0, iterations, self.config, interrupt, smooth)
+        return Mapped(window, result, time.perf_counter() - began)
 
-    def _new_recorder(self) -> Recorder:
-        return Recorder(plain=self.kernels_name != "gpu")
-
-    def _apply(self, result: MapResult, beside_s: float = 0.0) -> None:
-        frames = tuple(self.keyframes[i].frame for i in self._window)
+    def _apply(self, mapped: Mapped, beside_s: float = 0.0) -> None:
+        window, result = mapped.window, mapped.result
+        frames = tuple(self.keyframes[i].frame for i in window)
         self._landed = Landed(frames, result.losses, self._landed.beside_s + beside_s)
         if result.failed:
             self._note = "the mapping diverged and was undone"
             return
-        self._trained = max(
-            len(self.keyframes) - 1, 1
-        )  # the surface that these saw has been through two mappings by now
-        self.trajectory.move_keyframes(self._window, result.c2w)
+        self._follower.trust(max(len(self.keyframes) - 1, 1))  # what these saw has been through two mappings by now
+        self.trajectory.move_keyframes(window, result.c2w)
         self._frozen = self._tracking_field()
 
     def _apply_pending(self, block: bool) -> float:
@@ -328,39 +245,32 @@ class Slam:
         if self._pending is None or not (block or self._pending.done()):
             return 0.0
         began = time.perf_counter()
-        (result, took_s), self._pending = self._pending.result(), None
+        mapped, self._pending = self._pending.result(), None
         waited_s = time.perf_counter() - began
-        self._apply(result, took_s)
+        self._apply(mapped, mapped.took_s)
         return waited_s
 
     def _tracking_field(self) -> TsdfField:
         assert self.mapper is not None
         return self.mapper.field if self._pool is None else self.mapper.field.freeze(self._frozen)
 
-    # ---- keyframes, box, views --------------------------------------------------------------------------------------
+    def _new_recorder(self) -> Recorder:
+        return Recorder(plain=self.kernels_name != "gpu")
 
-    def _grow_box(self) -> None:
-        """Extend the scene box when over 1 % of the newest keyframe's points lie outside it; one from the configuration
-        stays, and a note says how many."""
+    def _take_note(self) -> str:
         assert self.mapper is not None
-        pixels = self.keyframes[-1].pixels
-        points = _world(pixels.take(evenly(len(pixels), BOX_POINTS)), self.trajectory[-1])
-        low, high = self.mapper.field.layout.box.numpy()
-        outside = ((points < low) | (points > high)).any(1).mean() if len(points) else 0.0
-        if self.config.field.box is None and outside > OUTSIDE_SHARE:
-            self.mapper.grow(box_of_points(points, self.config.field.box_margin_m))
-        elif outside > max(OUTSIDE_SHARE, 2 * self._outside):
-            self._outside = outside
-            self._note = f"{outside:.0%} of the rays end outside field.box and are not mapped; widen it or leave it out"
+        note, self._note = self._note, ""
+        for recorder in (self._follower.recorder, self.mapper.recorder):
+            if recorder.failure and not self._graphs_failed:
+                self._graphs_failed, note = True, note or recorder.failure
+        return note
+
+    # ---- views and settings ------------------------------------------------------------------------------------------
 
     def surface_points(self, limit: int) -> NDArray[np.float32]:
         """Measured points [N, 3] of all keyframes in the world, where the map has been observed: about ``limit`` of
         them where there are more."""
-        poses = self.trajectory.keyframe_poses()
-        stride = max(1, -(-sum(map(len, self.keyframes)) // limit))
-        thinned = [k.pixels.take(np.arange(0, len(k), stride)) for k in self.keyframes]
-        parts = [_world(pixels, pose) for pixels, pose in zip(thinned, poses, strict=True)]
-        return np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
+        return surface_points(self.keyframes, self.trajectory.keyframe_poses(), limit)
 
     @property
     def field(self) -> TsdfField | None:
@@ -396,11 +306,9 @@ class Slam:
             **prefixed("keyframes", pack_keyframes(self.keyframes)),
             **prefixed("mapper", self.mapper.state()),
             **prefixed("random", pack_random(self._rng, self._generator)),
-            "bounds": np.zeros((0, 3)) if self._bounds is None else self._bounds,
-            **prefixed("observed", self._observed.state() | {"trained": np.array(self._trained)}),
-            **prefixed("volume", self._volume.state() if self._volume is not None else {}),
+            "bounds": np.zeros((0, 3)) if self._box.given is None else self._box.given,
             "inside_loop": np.array(self._loops.inside),
-            "lost": np.array([self._recovery.lost, self._recovery.misses, self._recovery.usual_fit]),
+            **self._follower.state(),
         }
 
     @classmethod
@@ -415,19 +323,10 @@ class Slam:
         self.mapper = Mapper.restore(part("mapper", state), self._kernels, self.device, self._new_recorder())
         self._frozen = self._tracking_field()
         unpack_random(part("random", state), self._rng, self._generator)
-        self._observed.load(part("observed", state))
-        self._trained = int(state["observed.trained"])
-        if self._volume is not None:
-            self._volume.load(part("volume", state))
         self._loops.inside = bool(state["inside_loop"])
-        recovery, (lost, misses, usual_fit) = self._recovery, state["lost"]
-        recovery.lost, recovery.misses, recovery.usual_fit = bool(lost), int(misses), float(usual_fit)
+        self._follower.load(state)
         return self
 
     def _require_field(self) -> TsdfField:
         assert self._frozen is not None
         return self._frozen
-
-
-def _world(pixels: Pixels, c2w: NDArray[np.float64]) -> NDArray[np.float32]:
-    return (pixels.points() @ c2w[:3, :3].T + c2w[:3, 3]).astype(np.float32)

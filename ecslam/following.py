@@ -1,0 +1,131 @@
+"""Following the camera from frame to frame: the preset's tracker, and the way back when the map explains no frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .align import LearnedSurface, Surface
+from .config import Config
+from .field import TsdfField
+from .kernels import Backend
+from .kernels.graphs import Recorder
+from .keyframes import Keyframe, make_thumbnail, most_similar
+from .observed import ObservedVoxels
+from .observed_gpu import ObservedTable
+from .pixels import spread_pixels
+from .recovery import Recovery, around, best_start, relocalise
+from .samples import seeded
+from .saving import Arrays, part, prefixed
+from .tracker import LEAST_POINTS, HostTracker, Tracker, TrackResult
+from .trajectory import Trajectory
+from .types import Frame, Intrinsics
+from .volume import FusedVolume, create_volume
+
+if TYPE_CHECKING:
+    from .tracker_gpu import GpuTracker
+
+RELOCALISE_FROM = 5
+GAP_S = 1.0
+
+
+class Follower:
+    """Owns what tracking keeps: the fused volume, where the map has been observed, and how well it has gone so far."""
+
+    def __init__(
+        self,
+        config: Config,
+        camera: Intrinsics,
+        device: torch.device,
+        kernels_name: str,
+        kernels: Backend,
+        rng: np.random.Generator,
+        generator: torch.Generator,
+    ) -> None:
+        """rng: for pixels. generator: on a CPU, for the samples along rays."""
+        self._camera, self._kernels, self._rng = camera, kernels, rng
+        self._generator = generator if device.type == "cpu" else None
+        self.recorder = Recorder(plain=kernels_name != "gpu")
+        self.recovery = Recovery()
+        lengths, fused = (config.align.voxel_m, config.truncation_m), config.align.to == "fused"
+        self._volume = create_volume(kernels_name, *lengths, device, self.recorder) if fused else None
+        self._observed: ObservedVoxels | ObservedTable = ObservedVoxels()
+        self._gpu_tracker: GpuTracker | None = None
+        if kernels_name == "gpu" and fused:
+            self._observed = table = ObservedTable(device)
+            self._gpu_tracker = self._on_gpu(table, seeded(rng, device))
+        self._trusted = 0
+
+    def _on_gpu(self, observed: ObservedTable, generator: torch.Generator) -> GpuTracker:
+        from .tracker_gpu import GpuTracker
+
+        assert not isinstance(self._volume, FusedVolume | None)
+        return GpuTracker(self._camera, self._volume, observed, self._kernels, generator, self.recorder)
+
+    def follow(
+        self, frame: Frame, trajectory: Trajectory, keyframes: list[Keyframe], field: TsdfField, config: Config
+    ) -> TrackResult:
+        """The pose of the frame after ``trajectory``: a constant-velocity start, the preset's tracker on ``field``, and
+        recovery when the map does not explain the frame. ``recovery`` then says whether the pose is only predicted."""
+        if config.tracking.iterations > 0 or self._volume is None:
+            self._observe(trajectory, keyframes)
+        surface, tracker = self._tracker(field, config)
+        last, gap = trajectory[-1], frame.timestamp - trajectory.timestamps[-1] > GAP_S
+        guess = last if self.recovery.lost or gap else trajectory.predict()
+        track = best_start(lambda start: tracker.track(frame, start, field, config), around(guess) if gap else [guess])
+        return self.recovery.judge(track, last, lambda: self._find_again(frame, surface, trajectory, keyframes, config))
+
+    def fuse(self, frame: Frame, c2w: NDArray[np.float64], config: Config) -> None:
+        """Average a frame seen from c2w [4, 4] into the volume, where there is one."""
+        if self._volume is not None:
+            self._volume.integrate(frame, self._camera, c2w, config.depth_near_m, config.depth_far_m)
+
+    def trust(self, count: int) -> None:
+        """From now on the map may be trusted where the first ``count`` keyframes saw something."""
+        self._trusted = count
+
+    def _observe(self, trajectory: Trajectory, keyframes: list[Keyframe]) -> None:
+        for view in range(self._observed.views, self._trusted):
+            self._observed.add(keyframes[view].pixels.points(), trajectory.keyframe_poses()[view])
+
+    def _tracker(self, field: TsdfField, config: Config) -> tuple[Surface, Tracker]:
+        """The surface that frames are aligned to, and what tracks them."""
+        if self._gpu_tracker is not None:
+            return self._gpu_tracker.volume, self._gpu_tracker
+        observed, kernels = self._observed, self._kernels
+        assert isinstance(observed, ObservedVoxels)
+        learned = LearnedSurface(field, kernels, config.truncation_m, observed)
+        surface = learned if self._volume is None else self._volume
+        tracker = HostTracker(self._camera, surface, observed, kernels, self._rng, self._generator, self.recorder)
+        return surface, tracker
+
+    def _find_again(
+        self, frame: Frame, surface: Surface, trajectory: Trajectory, keyframes: list[Keyframe], config: Config
+    ) -> TrackResult | None:
+        """Relocalisation from the last pose and the keyframes that look most alike; None where hardly anything is
+        measured."""
+        measured = spread_pixels(frame, self._camera, config.align.points, config, self._rng)
+        if len(measured.points()) < LEAST_POINTS:
+            return None
+        alike = most_similar(keyframes, make_thumbnail(frame.color), RELOCALISE_FROM)
+        starts = np.stack([trajectory[-1], *trajectory.keyframe_poses()[alike]])
+        return relocalise(surface, measured, starts, config, np.random.default_rng([config.seed, frame.index]))
+
+    def state(self) -> Arrays:
+        """What ``load`` needs, as arrays nobody writes to afterwards."""
+        return {
+            **prefixed("observed", self._observed.state() | {"trained": np.array(self._trusted)}),
+            **prefixed("volume", self._volume.state() if self._volume is not None else {}),
+            "lost": self.recovery.state(),
+        }
+
+    def load(self, state: Arrays) -> None:
+        """Go on from what ``state`` gave."""
+        self._observed.load(part("observed", state))
+        self._trusted = int(state["observed.trained"])
+        if self._volume is not None:
+            self._volume.load(part("volume", state))
+        self.recovery.load(state["lost"])
