@@ -129,6 +129,16 @@ def apply(config: Config, values: Mapping[str, Any], source: str) -> Config:
     return result
 
 
+def changes(before: Any, after: Any) -> dict[str, Any]:
+    """What ``apply`` lays over ``before`` to get ``after``: nested plain dictionaries of the values that differ."""
+    out: dict[str, Any] = {}
+    for f in fields(before):
+        was, now = getattr(before, f.name), getattr(after, f.name)
+        if was != now:
+            out[f.name] = changes(was, now) if is_dataclass(was) else now
+    return out
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Nested plain dictionaries, ready for YAML or JSON."""
     out: dict[str, Any] = {}

@@ -82,6 +82,12 @@ def test_settings_of_one_group_add_up_and_the_last_of_a_key_counts():
     assert (c.mapping.rays, c.mapping.every, c.mapping.iterations, c.seed) == (60, 10, 10, 2)
 
 
+def test_changes_are_what_leads_from_one_configuration_to_another():
+    live, full = load_preset("live"), load_preset("full")
+    assert config_files.apply(live, config_files.changes(live, full), "here") == full
+    assert config_files.changes(live, apply_settings(live, ["mapping.rays=99"])) == {"mapping": {"rays": 99}}
+
+
 def test_scientific_notation_is_a_number():
     assert apply_settings(Config(), ["mapping.lr_grid=1e-3"]).mapping.lr_grid == 1e-3
 

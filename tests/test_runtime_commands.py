@@ -43,7 +43,6 @@ from ecslam.messages import (
 )
 from ecslam.runtime import workshop
 from ecslam.runtime.checkpoint import load_checkpoint
-from ecslam.runtime.control import Control
 from ecslam.runtime.protocol import EngineHandle
 
 LONG = Behaviour(first_interrupts=100_000, pause_s=0.001)
@@ -237,30 +236,6 @@ def test_a_request_that_fails_is_told_and_the_run_goes_on(tmp_path, monkeypatch)
         watch.ask(RequestPictures())
         assert "division by zero" in watch.event(Notice).text
         watch.go(Resume(), State.FINISHED)
-
-
-def test_steps_asked_for_while_one_is_at_work_add_up():
-    control = Control(Config(), lambda _: None, (), ())
-    control.begin(Config(), "fake", 30)
-    for _ in range(3):
-        control.submit(Step())
-    paused = []
-    for done in (1, 2, 3):
-        control.stepped(done, False)
-        paused.append(control._paused)
-    assert paused == [False, False, True]
-    control.submit(RunTo(20))
-    control.submit(Step())
-    control.stepped(4, False)
-    assert control._paused
-
-
-def test_a_restart_with_the_same_preset_keeps_the_settings_it_began_with():
-    began = config_files.apply_settings(config_files.load_preset("live"), ["mapping.iterations=12"])
-    control = Control(began, lambda _: None, (), ("live", "full"))
-    control.begin(began, "", 30)
-    assert control.restart_config(Restart(preset="live"), "").mapping.iterations == 12
-    assert control.restart_config(Restart(preset="full"), "") == config_files.load_preset("full")
 
 
 def test_restart_begins_again_beside_the_first_run(tmp_path):

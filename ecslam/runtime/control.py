@@ -204,23 +204,24 @@ class Control:
         if command.preset not in (None, wanted.preset):
             other = config_files.for_layout(config_files.load_preset(command.preset), layout)
             wanted = replace(other, seed=wanted.seed, schedule=wanted.schedule)
+        elif layout != self._layout:
+            preset = config_files.load_preset(wanted.preset)
+            before, after = (config_files.for_layout(preset, name) for name in (self._layout, layout))
+            wanted = config_files.apply(after, config_files.changes(before, wanted), "restart")
         given = {"seed": command.seed, "schedule": command.schedule}
         return config_files.apply(wanted, {k: v for k, v in given.items() if v is not None}, "restart")
 
     # ---- for the engine thread ------------------------------------------------------------------------------------
 
     def begin(self, config: Config, layout: str, total: int, position: int = 0) -> None:
-        """A run over ``total`` frames of a ``layout`` is about to start at ``position``; its commands are taken now and
-        what was asked of the run before is dropped."""
+        """A run over ``total`` frames of a ``layout`` is about to start at ``position``; its commands are taken now,
+        and those that came since ``take_restart`` are its own."""
         with self._changed:
-            self._work.clear()
             self._layout = layout
             self.config = self._started_with = config
             self.position, self._total = position, total
-            self.over = self._stop = self._paused = self._announced = False
-            self._pause_at = self._restart = None
-            if not self.quitting:
-                self._leave_at = math.inf
+            self.over = self._paused = self._announced = False
+            self._pause_at = None
 
     def next_turn(self, last_step: float) -> Turn:
         """Wait for something to do. last_step: ``monotonic()`` when the last frame was begun, for the speed limit."""
@@ -270,10 +271,15 @@ class Control:
             self.over, self._stop = True, False
 
     def take_restart(self) -> Restart:
-        """The restart that was asked for; it is over with the next ``begin``."""
+        """The restart that was asked for; what else was asked of the run before is dropped, exports excepted."""
         with self._changed:
-            assert self._restart is not None
-            return self._restart
+            restart, self._restart = self._restart, None
+            assert restart is not None
+            self._work = deque(item for item in self._work if isinstance(item[1], Export))
+            self._stop = False
+            if not self.quitting:
+                self._leave_at = math.inf
+            return restart
 
     def take_work(self, kinds: tuple[type, ...] = ()) -> list[tuple[int, Command]]:
         """Waiting work with command ids, oldest first; only commands of ``kinds`` where given."""

@@ -181,7 +181,7 @@ class Engine:
             self._control.begin(plan.config, plan.sequence.layout, len(plan.sequence))
             self._plan, self._run = plan, self._open_run(plan)
         except (InputError, OSError) as error:
-            self._control.begin(plan.config, plan.sequence.layout, 0)
+            self._control.begin(self._plan.config, self._plan.sequence.layout, 0)
             self._control.end()
             self._failed(error)
             self._show(State.FAILED, str(error))
