@@ -58,11 +58,18 @@ def pick_device(name: str, config: Config | None = None) -> str:
     if name == "auto":
         return "cuda" if torch.cuda.is_available() and _room_on_gpu(config) else "cpu"
     try:
-        kind = torch.device(name).type
+        device = torch.device(name)
     except RuntimeError:
-        raise InputError(f"--device {name}: no such device; use cpu, cuda or auto") from None
-    if kind == "cuda" and not torch.cuda.is_available():
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise InputError(f"--device {name}: no such device; use cpu, cuda or auto")
+    if device.type == "cpu":
+        return "cpu"
+    if not torch.cuda.is_available():
         raise InputError(f"--device {name}: torch sees no CUDA GPU here; use --device cpu")
+    if (device.index or 0) >= torch.cuda.device_count():
+        last = torch.cuda.device_count() - 1
+        raise InputError(f"--device {name}: no such GPU; the last one that torch sees here is cuda:{last}")
     return name
 
 

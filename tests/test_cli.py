@@ -23,7 +23,7 @@ from ecslam.commands import draw_picture
 from ecslam.config_files import apply_settings, load_config, load_preset
 from ecslam.datasets.meshes import load_mesh
 from ecslam.runtime.mesh_files import mesh_bytes
-from ecslam.types import Mesh
+from ecslam.types import InputError, Mesh
 
 ROOM = "synthetic/studio?size=160x120"
 SETTINGS = {
@@ -278,6 +278,8 @@ def test_a_missing_depth_image(sequence, tmp_path):
         (["--frames", "90:99"], ["selects nothing", "0 .. 7"]),
         (["--frames", "5:0:-1"], ["--frames 5:0:-1", "STEP"]),
         (["--device", "tpu9"], ["--device tpu9", "cpu, cuda"]),
+        (["--device", "meta"], ["--device meta", "cpu, cuda"]),
+        (["--device", "mps"], ["--device mps", "cpu, cuda"]),
     ],
 )
 def test_a_wrong_option(sequence, tmp_path, words, parts):
@@ -295,6 +297,14 @@ def test_a_file_for_another_preset_than_the_one_asked_for(sequence, tmp_path):
 def test_a_gpu_that_is_not_there(sequence, tmp_path):
     outcome = ecslam("run", sequence, "--headless", "--device", "cuda", "--out", tmp_path / "run")
     assert_refused(outcome, "--device cuda", "--device cpu")
+
+
+def test_a_gpu_beyond_those_that_are_there(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert [commands.pick_device(name) for name in ("cuda", "cuda:1", "cpu:3")] == ["cuda", "cuda:1", "cpu"]
+    with pytest.raises(InputError, match=r"--device cuda:9: no such GPU; the last one .* is cuda:1"):
+        commands.pick_device("cuda:9")
 
 
 @pytest.mark.parametrize(
