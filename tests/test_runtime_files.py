@@ -14,11 +14,13 @@ import trimesh
 from ecslam.atomic import write_atomic
 from ecslam.messages import Notice
 from ecslam.runtime import files
+from ecslam.runtime.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from ecslam.runtime.files import LineLog, keep_lines, read_lines, require_space, to_json
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.runtime.runfolder import CAMERA, RunFolder, read_about
 from ecslam.types import InputError, Mesh
 
+ABOUT = {"sequence": "room", "frames": "", "frames_total": 3, **dict.fromkeys(CAMERA, 9)}
 FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
@@ -131,7 +133,7 @@ def test_a_run_whose_description_is_damaged_is_one_clear_line(tmp_path, content)
 
 def test_a_new_run_replaces_the_old_one_and_nothing_else(tmp_path):
     folder = RunFolder.create(tmp_path / "r", print)
-    folder.write("run.json", {"sequence": "room", "frames": "", "frames_total": 3, **dict.fromkeys(CAMERA, 9)})
+    folder.write("run.json", ABOUT)
     folder.write("summary.json", {"frames": 1})
     folder.write("picture.png", b"old")
     folder.write("exports/mesh.ply", b"kept")
@@ -142,6 +144,26 @@ def test_a_new_run_replaces_the_old_one_and_nothing_else(tmp_path):
     assert not (tmp_path / "r/picture.png").exists()
     assert (tmp_path / "r/events.jsonl").read_text() == ""
     assert (tmp_path / "r/exports/mesh.ply").read_bytes() == b"kept"
+
+
+def test_a_new_run_empties_a_linked_folder_and_stays_in_it(tmp_path):
+    for name in ("r", "large"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "r/run.json").write_text(to_json(ABOUT))
+    (tmp_path / "r/checkpoints").symlink_to(tmp_path / "large")
+    save_checkpoint(tmp_path / "r/checkpoints", Checkpoint(30, {}))
+    RunFolder.create(tmp_path / "r", print).close()
+    save_checkpoint(tmp_path / "r/checkpoints", Checkpoint(12, {}))
+    assert load_checkpoint(tmp_path / "r/checkpoints").frame == 12
+    assert (tmp_path / "large/000012.json").is_file()
+
+
+@pytest.mark.parametrize("name", ["picture.png", "checkpoints/000030.json", "meshes/000001.ply"])
+def test_a_run_that_cannot_be_removed_is_not_mixed_with_a_new_one(tmp_path, name):
+    (tmp_path / "run.json").write_text(to_json(ABOUT))
+    (tmp_path / name).mkdir(parents=True)
+    with pytest.raises(InputError, match=rf"{name}: cannot be removed for a new run \(.*\); remove it, or .* --out"):
+        RunFolder.create(tmp_path, print)
 
 
 def test_what_could_not_be_saved_is_said_once_and_forgotten_when_it_is(tmp_path, monkeypatch):

@@ -24,7 +24,6 @@ says what is missing, and why.
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -59,17 +58,14 @@ class RunFolder:
     def create(cls, path: Path, problem: Callable[[str], None], needed_mb: float = NEEDED_MB) -> RunFolder:
         """Start a run in ``path``; an earlier run there is replaced.
 
-        Raises InputError when the folder takes no files, has too little space, holds something else than a run, or when
-        a run is at work there.
+        Raises InputError when the folder takes no files, has too little space, holds something else than a run or one
+        that cannot be removed, or when a run is at work there.
         """
         if path.is_dir() and not _holds_a_run(path):
             raise InputError(f"{path}: holds other files and no run; give --out a new or empty folder")
         require_space(path, needed_mb)
         lock = claim(path)
-        for name in (*FILES, *LOGS):
-            (path / name).unlink(missing_ok=True)
-        for name in FOLDERS:
-            shutil.rmtree(path / name, ignore_errors=True)
+        _remove_run(path)
         folder = cls(path, problem, lock)
         folder.go_on(0)
         return folder
@@ -201,6 +197,20 @@ def _holds_a_run(path: Path) -> bool:
         ours = {*LOGS, "run.json", "config.yaml", *FOLDERS}
         found = [p for p in path.iterdir() if not p.name.startswith(".")]
         return all(p.name in ours and not (p.is_dir() and any(p.iterdir())) for p in found)
+
+
+def _remove_run(path: Path) -> None:
+    """Remove the files of a run. Its folders stay, emptied: they may be links. Raises InputError."""
+    try:
+        for name in (*FILES, *LOGS, *FOLDERS):
+            place = path / name
+            for file in place.iterdir() if name in FOLDERS and place.is_dir() else [place]:
+                file.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or path}: cannot be removed for a new run ({error.strerror}); remove it, or begin one "
+            "elsewhere with ecslam run --out"
+        ) from None
 
 
 def _thumbnail(frame: int) -> str:
