@@ -423,25 +423,50 @@ def test_a_mesh_that_cannot_be_made_is_said(tmp_path, monkeypatch):
     assert f"mesh.ply was not made; make it with: ecslam mesh {tmp_path}" in summary["warnings"]
 
 
-def test_a_gpu_without_memory_is_one_clear_line_with_what_the_preset_needs(tmp_path):
-    class OutOfMemoryError(RuntimeError):
-        """As torch names it."""
+class OutOfMemoryError(RuntimeError):
+    """As torch names it."""
 
-    def step(self, frame, interrupt=None):
+
+def raising(method: str):
+    """A factory of engines proper whose ``method`` finds no memory."""
+
+    def fail(*_):
         raise OutOfMemoryError("CUDA out of memory.\nTried to allocate 20 GiB")
 
-    make = maker()
-
-    def make_small(*args, **options):
-        slam = make(*args, **options)
-        slam.step = step.__get__(slam)
+    def make(*args, **options):
+        slam = maker()(*args, **options)
+        setattr(slam, method, fail)
         return slam
 
+    return make
+
+
+@pytest.mark.parametrize(("method", "frames"), [("step", 0), ("finish", 30)])
+def test_a_gpu_without_memory_is_one_clear_line_and_keeps_what_there_is(tmp_path, method, frames):
     with pytest.raises(
         InputError, match=r"cuda: out of memory; preset lite needs about \d{3,4} MB.*--device cpu"
     ) as told:
-        run(tmp_path, make=make_small, device="cuda")
+        run(tmp_path, make=raising(method), device="cuda")
     assert "\n" not in str(told.value)
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == frames
+    assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == frames
+    logged = [e["text"] for e in read_lines(tmp_path / "events.jsonl") if e["level"] == "error"]
+    assert logged == [str(told.value)]
+
+
+def test_a_run_whose_last_mapping_failed_is_resumed(tmp_path):
+    with pytest.raises(InputError, match="out of memory"):
+        run(tmp_path, make=raising("finish"))
+    make = maker()
+    assert Engine.resume(tmp_path, sequence=FakeSequence(30), make=make).run()["frames"] == 30
+    assert make.made[0].finished
+
+
+def test_a_map_that_cannot_be_copied_costs_the_mesh_and_no_more(tmp_path, monkeypatch):
+    monkeypatch.setattr("ecslam.runtime.workshop.Workshop.keep", lambda *_: None)
+    summary = run(tmp_path, make=raising("query"))
+    assert summary["frames"] == 30
+    assert summary["warnings"] == [f"mesh.ply was not made (CUDA out of memory.); make it with: ecslam mesh {tmp_path}"]
 
 
 def test_the_estimate_of_memory_grows_with_the_preset():

@@ -22,7 +22,7 @@ from ..types import Frame, FrameError, InputError, Sequence
 from .ahead import preparation
 from .checkpoint import Checkpoint, load_checkpoint
 from .control import Control, Turn
-from .driven import Abandoned, SlamFactory, make_slam
+from .driven import Abandoned, SlamFactory, make_slam, out_of_memory
 from .feed import Feed, FeedSubscription
 from .files import beside
 from .memory import keep_no_holes
@@ -228,12 +228,18 @@ class Engine:
         return turn
 
     def _finish(self, run: Run, complete: bool) -> None:
-        """Final poses, mesh, summary; an incomplete run ends without the last mapping and without the mesh."""
-        run.end(complete, self._interrupt(run, lambda: self._control.leaving))
-        began = monotonic()
-        if complete:
-            self._workshop.final(run, self._control)
-        self.summary = run.close(monotonic() - began)
+        """Final poses, mesh, summary; an incomplete run ends without the last mapping and without the mesh, one whose
+        last mapping fails without the mesh."""
+        export_s = 0.0
+        try:
+            run.end(complete, self._interrupt(run, lambda: self._control.leaving))
+            if complete:
+                began = monotonic()
+                self._workshop.final(run, self._control)
+                export_s = monotonic() - began
+        except Exception as error:
+            self._failed(error)
+        self.summary = run.close(export_s)
 
     def _frames(self, run: Run, frames: Items) -> Turn:
         """Step through the frames as the commands want it; what ended that (STOP also at the sequence's end)."""
@@ -291,6 +297,7 @@ class Engine:
             self._emit(Notice("info", PREPARING))
 
     def _failed(self, error: Exception) -> None:
+        error = out_of_memory(error, self._run.config, self._run.plan.device) or error
         self.error = self.error or error
         self._run.notice("error", _words(error))
 

@@ -22,7 +22,7 @@ from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
-from .driven import Abandoned, SlamFactory, SlamLike, out_of_memory
+from .driven import Abandoned, SlamFactory, SlamLike
 from .driven import State as Arrays
 from .memory import return_holes
 from .meshjobs import MESH_POINTS, FrozenMap
@@ -168,11 +168,9 @@ class Run:
             self.slam = self.slam if self.tally.rows else None
             self._skip(index, str(error))
             return None
-        except BaseException as error:
+        except BaseException:
             self.torn = True
             self.tally.position = index
-            if (told := out_of_memory(error, self.config, self.plan.device)) is not None:
-                raise told from error
             raise
         self._record(report, item)
         return report
@@ -350,13 +348,20 @@ class Run:
         """Make the poses final (the last mapping, when ``complete`` and not torn) and save them. Stops the clock.
 
         A last mapping that ``interrupt`` abandons leaves the map half-way: no checkpoint holds it, and ``resume`` makes
-        it from the one before.
+        it from the one before. Raises what else ended it, after the poses are saved.
         """
-        if complete and self.slam is not None and self.tally.rows and not self.torn and not self._settled:
-            try:
+        try:
+            if complete and self.slam is not None and self.tally.rows and not self.torn and not self._settled:
                 self.slam.finish(self._counted(interrupt))
-            except Abandoned:
-                complete, self.torn = False, True
+        except Abandoned:
+            complete, self.torn = False, True
+        except Exception:
+            self.torn = True
+            raise
+        finally:
+            self._save_final(complete)
+
+    def _save_final(self, complete: bool) -> None:
         self.clock.pause()
         self.tally.wall_s = self.clock.seconds
         self.measure()

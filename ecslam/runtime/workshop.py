@@ -110,8 +110,15 @@ class Workshop:
                 self._jobs.submit(lambda: self._save(run, name, frozen, KEPT_VOXEL_M, KEPT_TRIANGLES))
 
     def final(self, run: Run, control: Control) -> None:
-        """``mesh.ply`` at the map's finest voxel; given up when the engine is asked to leave."""
-        frozen, done = run.freeze(), threading.Event()
+        """``mesh.ply`` at the map's finest voxel; given up when the engine is asked to leave. Where the map cannot
+        even be copied, that costs the mesh and no more."""
+        done = threading.Event()
+        try:
+            frozen = run.freeze()
+            self.live(run, at_once=True)
+        except Exception as error:
+            run.warn(_without_mesh(run, f" ({(str(error) or type(error).__name__).splitlines()[0]})"))
+            return
         if frozen is None:
             return
 
@@ -122,11 +129,10 @@ class Workshop:
                 done.set()
                 control.wake()
 
-        self.live(run, at_once=True)
         self._jobs.submit(job)
         control.wait_for(done.is_set)
         if not (run.folder.path / "mesh.ply").is_file():
-            run.warn(f"mesh.ply was not made; make it with: ecslam mesh {run.folder.path}")
+            run.warn(_without_mesh(run))
 
     def _save(self, run: Run, name: str, frozen: FrozenMap, voxel_m: float, max_triangles: int) -> None:
         mesh = build_mesh(frozen, voxel_m, max_triangles, self._leaving).mesh
@@ -134,6 +140,10 @@ class Workshop:
 
     def _complain(self, text: str) -> None:
         self._feed.publish(Notice("error", text))
+
+
+def _without_mesh(run: Run, why: str = "") -> str:
+    return f"mesh.ply was not made{why}; make it with: ecslam mesh {run.folder.path}"
 
 
 def _freeze(run: Run) -> FrozenMap:
