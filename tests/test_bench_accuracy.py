@@ -1,12 +1,14 @@
 """The accuracy benchmark: every variant runs with every seed, a failed run is counted, figures are those of `eval`."""
 
 import io
+import os
 import re
 
 import pytest
 from rich.console import Console
 
 from ecslam.bench import accuracy
+from ecslam.bench.runs import in_own_process
 from ecslam.types import InputError
 
 TINY = """
@@ -48,6 +50,14 @@ def test_means_deviations_and_failures_are_shown():
     assert re.search(r"Depth L1 \(cm\) +│ +│ +0\.75", text.getvalue())
     assert re.search(r"failed runs +│ +1 │ +0", text.getvalue())
     assert "fus=false" in text.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("job", "arguments", "says"),
+    [(os._exit, (9,), "its process was killed, perhaps for lack of memory"), (divmod, (1, 0), "by zero")],
+)
+def test_a_run_that_fails_or_is_killed_is_counted_by_its_error(job, arguments, says):
+    assert says in in_own_process(job, arguments)["error"]
 
 
 def test_what_cannot_run_is_refused_before_anything_runs(tmp_path):

@@ -3,6 +3,7 @@
 import importlib.util
 import io
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from rich.console import Console
 
 from ecslam.bench import speed
 from ecslam.bench.peer import open3d_missing
+from ecslam.bench.runs import preset_config
+from ecslam.config_files import apply_settings, for_layout, load_preset
 from ecslam.types import InputError
 
 TINY = """
@@ -71,10 +74,35 @@ def test_the_ratio_to_the_rival_is_printed():
     rival = {"fps_wall": 6.0, "ate_rmse_cm": 2.1}
     about = {"sequence": "a", "frames": "", "machine": "x", "repeats": 3, "peer_note": ""}
     text = io.StringIO()
-    result = about | {"presets": {"live": m}, "peer": rival, "ratio": {"live": 2.0}}
+    result = about | {"presets": {"live": m}, "errors": {"live": []}, "peer": rival, "ratio": {"live": 2.0}}
     speed.print_table(result, Console(file=text, width=200))
     assert re.search(r"times the rival's frames/s +│ +2\.00", text.getvalue())
     assert "30.00" in text.getvalue()
+
+
+def test_runs_that_fail_are_counted_and_not_averaged_away(monkeypatch):
+    turns = {"live": [6.0, None, 8.0], "lite": [None, None, None]}
+
+    def run(job, arguments):
+        rate = turns[arguments[1]].pop(0)
+        return {"error": "the map exploded"} if rate is None else {"fps_wall": rate, "cost_ms": [], "memory_frame": []}
+
+    monkeypatch.setattr(speed, "in_own_process", run)
+    result = speed.bench_speed(ROOM, ["live", "lite"], "0:2", 3, "cpu")
+    assert list(result["presets"]) == ["live"]
+    assert result["presets"]["live"]["fps_wall"] == 7.0
+    assert result["errors"] == {"live": ["the map exploded"], "lite": 3 * ["the map exploded"]}
+    text = io.StringIO()
+    speed.print_table(result, Console(file=text, width=200))
+    assert "live: 1 of 3 runs failed, the first because: the map exploded" in text.getvalue()
+    assert "lite: 3 of 3 runs failed" in text.getvalue()
+
+
+def test_a_preset_file_begins_from_what_the_layout_asks_for(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("preset: full\nseed: 3")
+    sequence = SimpleNamespace(preset="lite", layout="tum")
+    assert preset_config(str(path), sequence) == apply_settings(for_layout(load_preset("full"), "tum"), ["seed=3"])
 
 
 def test_a_wrong_preset_is_refused_before_anything_runs():

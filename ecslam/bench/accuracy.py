@@ -78,16 +78,13 @@ def bench_accuracy(
 def measure(
     sequence: str, preset: str, settings: list[str], frames: str, seed: int, device: str, surface: bool
 ) -> Figures:
-    """One headless run in a temporary folder and its comparison with the ground truth; ``error`` when it failed."""
+    """One headless run in a temporary folder and its comparison with the ground truth."""
     opened = open_sequence(sequence)
     config: Config = apply_settings(preset_config(preset, opened), [*settings, f"seed={seed}"])
     with tempfile.TemporaryDirectory(prefix="ecslam-bench-") as parent, progress(preset) as show:
         folder = Path(parent) / "run"
-        try:
-            summary = Engine(config, sequence, folder, device=device, frames=frames).run(show)
-            return summary | judge_run(folder, surface=surface)
-        except Exception as error:
-            return {"error": str(error) or type(error).__name__}
+        summary = Engine(config, sequence, folder, device=device, frames=frames).run(show)
+        return summary | judge_run(folder, surface=surface)
 
 
 def print_table(result: Figures, console: Console | None = None) -> None:

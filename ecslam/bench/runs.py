@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,20 @@ Figures = dict[str, Any]
 def preset_config(preset: str, sequence: Sequence) -> Config:
     """What ``ecslam run`` would use: with --config for a YAML file, else with --preset. Raises InputError."""
     if preset.endswith((".yaml", ".yml")):
-        return load_config(Path(preset), for_layout(load_preset(sequence.preset), sequence.layout))
+        base = for_layout(load_preset(sequence.preset), sequence.layout)
+        return load_config(Path(preset), base, sequence.layout)
     return for_layout(load_preset(preset), sequence.layout)
 
 
 def in_own_process(job: Callable[..., Figures], arguments: tuple[Any, ...]) -> Figures:
-    """``job(*arguments)`` in a fresh process, so that memory and thread pools are its own."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(job, *arguments).result()
+    """``job(*arguments)`` in a fresh process, so that memory and thread pools are its own; ``error`` when it failed."""
+    try:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            return pool.submit(job, *arguments).result()
+    except BrokenProcessPool:
+        return {"error": "its process was killed, perhaps for lack of memory"}
+    except Exception as error:
+        return {"error": str(error) or type(error).__name__}
 
 
 @contextmanager

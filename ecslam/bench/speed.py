@@ -51,8 +51,9 @@ def bench_speed(
     """Run each preset ``repeats`` times on the same frames, taking turns, and compare medians.
 
     presets: names of presets, or YAML files. Returns plain values: the machine; under ``presets`` for each one the
-    medians of what ``measure`` gives; under ``peer`` the rival's (None without it, ``peer_note`` says why); under
-    ``ratio`` wall-clock frames/s over the rival's. Raises InputError for a preset or a sequence that cannot be used.
+    medians of what ``measure`` gives, of the runs that did not fail, if any; under ``errors`` what ended the others;
+    under ``peer`` the rival's (None without it, ``peer_note`` says why); under ``ratio`` wall-clock frames/s over the
+    rival's. Raises InputError for a preset or a sequence that cannot be used.
     """
     opened = select_frames(open_sequence(sequence), frames)
     for preset in presets:
@@ -66,9 +67,12 @@ def bench_speed(
     runs: dict[str, list[Figures]] = {name: [] for name in jobs}
     for turn in range(repeats):
         for name, (job, arguments) in jobs.items():
-            runs[name].append(in_own_process(job, arguments))
-            say(f"{name}, run {turn + 1} of {repeats}: {runs[name][-1]['fps_wall']:.2f} frames/s")
-    medians = {name: _medians(found) for name, found in runs.items()}
+            figures = in_own_process(job, arguments)
+            runs[name].append(figures)
+            rate = figures.get("error") or f"{figures['fps_wall']:.2f} frames/s"
+            say(f"{name}, run {turn + 1} of {repeats}: {rate}")
+    good = {name: [run for run in found if "error" not in run] for name, found in runs.items()}
+    medians = {name: _medians(found) for name, found in good.items() if found}
     rival = medians.pop(PEER, None)
     return {
         "sequence": sequence,
@@ -78,6 +82,7 @@ def bench_speed(
         "threads": torch.get_num_threads(),
         "repeats": repeats,
         "presets": medians,
+        "errors": {name: [run["error"] for run in found if "error" in run] for name, found in runs.items()},
         "peer": rival,
         "peer_note": note,
         "ratio": {name: m["fps_wall"] / rival["fps_wall"] for name, m in medians.items()} if rival else {},
@@ -141,6 +146,10 @@ def print_table(result: Figures, console: Console | None = None) -> None:
     if result["ratio"]:
         table.add_row("times the rival's frames/s", *(_cell(result["ratio"].get(name)) for name in columns))
     console.print(table)
+    for name, errors in result["errors"].items():
+        if errors:
+            text = f"{name}: {len(errors)} of {result['repeats']} runs failed, the first because: {errors[0]}"
+            console.print(text, soft_wrap=True, markup=False)
     if result["peer_note"]:
         console.print(result["peer_note"])
 
