@@ -10,6 +10,7 @@ import typer
 
 from . import config_files
 from .config import Config
+from .runtime.files import require_place
 from .types import InputError, Sequence
 
 app = typer.Typer(
@@ -22,6 +23,14 @@ app = typer.Typer(
 )
 bench = typer.Typer(help="Measure: back ends against each other, speed, accuracy.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
+
+
+def _place(option: typer.CallbackParam, file: Path | None) -> Path | None:
+    """What an option names, once it is sure that it can be written. Raises InputError."""
+    if file is not None:
+        require_place(file, f"--{option.name}")
+    return file
+
 
 SequenceArgument = Annotated[
     str,
@@ -53,6 +62,7 @@ Data = Annotated[
 Host = Annotated[str, typer.Option(help="Where the dashboard listens; any but 127.0.0.1 needs the token it prints.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the dashboard; 0 = any free one.")]
 NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Do not open a browser; the address is printed.")]
+Json = Annotated[Path | None, typer.Option(callback=_place, help="Write every figure to this file.")]
 RunFolder = Annotated[Path, typer.Argument(help="A run folder, as `ecslam run` leaves it.")]
 
 
@@ -196,7 +206,7 @@ def check(sequence: SequenceArgument) -> None:
 def bench_kernels(
     rays: Annotated[int, typer.Option(min=1, help="Rays; 43 samples each.")] = 1000,
     repeats: Annotated[int, typer.Option(min=3, help="Runs of each; medians are printed.")] = 5,
-    json: Annotated[Path | None, typer.Option(help="Write every figure to this file.")] = None,
+    json: Json = None,
 ) -> None:
     """Time the fast back ends against the plain torch reference, in turn, on one mapping and one tracking step."""
     from . import commands
@@ -215,8 +225,10 @@ def bench_speed(
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each; medians are printed.")] = 3,
     device: Device = "auto",
     peer: Annotated[bool, typer.Option("--peer", help="Also run Open3D's dense SLAM, if it is installed.")] = False,
-    json: Annotated[Path | None, typer.Option(help="Write every figure to this file.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Write a plot of the cost per frame to this PNG file.")] = None,
+    json: Json = None,
+    plot: Annotated[
+        Path | None, typer.Option(callback=_place, help="Write a plot of the cost per frame to this PNG file.")
+    ] = None,
 ) -> None:
     """Frames per second, all included; time per stage; growth of cost and memory; a rival beside it."""
     from . import commands
@@ -238,7 +250,7 @@ def bench_viewers(
     viewers: Annotated[int, typer.Option(min=1, max=200, help="How many pages are open at once.")] = 20,
     pairs: Annotated[int, typer.Option(min=1, help="Comparisons at most; the median is printed.")] = 5,
     device: Device = "auto",
-    json: Annotated[Path | None, typer.Option(help="Write every figure to this file.")] = None,
+    json: Json = None,
 ) -> None:
     """Frames per second with many open pages against none, in turn within one run."""
     from . import commands
@@ -259,7 +271,7 @@ def bench_accuracy(
     no_surface: Annotated[bool, typer.Option("--no-surface", help="Trajectories only: saves a minute a run.")] = False,
     settings: Settings = None,
     device: Device = "auto",
-    json: Annotated[Path | None, typer.Option(help="Write every figure to this file.")] = None,
+    json: Json = None,
 ) -> None:
     """Trajectory and surface against the ground truth, mean and deviation over seeds; the paper's ablation."""
     from . import commands

@@ -26,7 +26,7 @@ from .messages import Notice, Quit, Snapshot, State
 from .runtime.checkpoint import load_checkpoint
 from .runtime.driven import estimate_mb, import_slam
 from .runtime.engine import Engine
-from .runtime.files import beside, to_json
+from .runtime.files import beside, require_place, to_json
 from .runtime.judge import judge_run, read_mesh, read_truth
 from .runtime.mesh_files import mesh_bytes
 from .runtime.meshjobs import MESH_POINTS, FrozenMap, build_mesh
@@ -329,8 +329,7 @@ def remesh(folder: Path, voxel_m: float, out: Path) -> None:
     if out.suffix not in (".ply", ".glb", ".obj"):
         raise InputError(f"--out {out}: end the name in .ply, .glb or .obj")
     checkpoint = load_checkpoint(folder / "checkpoints")
-    if not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
+    require_place(out, "--out")
     config = config_files.apply(Config(), checkpoint.meta["config"], str(folder))
     about = read_about(folder)
     camera = Intrinsics(**{name: about[name] for name in CAMERA})
@@ -338,7 +337,7 @@ def remesh(folder: Path, voxel_m: float, out: Path) -> None:
     sdf, color = slam.query()
     with console.status("meshing"):
         made = build_mesh(FrozenMap(len(slam.trajectory) - 1, sdf, color, slam.surface_points(MESH_POINTS)), voxel_m)
-    write_atomic(out, mesh_bytes(made.mesh, out.suffix[1:]))
+    _save(out, mesh_bytes(made.mesh, out.suffix[1:]))
     console.print(f"{out}: {len(made.mesh.vertices)} vertices, {len(made.mesh.faces)} triangles", soft_wrap=True)
 
 
@@ -356,9 +355,16 @@ def write_synthetic(name: str, folder: Path, frames: str) -> None:
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
-    """Write figures to a file, when one is wanted."""
+    """Write figures to a file, when one is wanted. Raises InputError."""
     if path is not None:
-        write_atomic(path, to_json(result).encode())
+        _save(path, to_json(result).encode())
+
+
+def _save(path: Path, data: bytes) -> None:
+    try:
+        write_atomic(path, data)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); make room, or name another place") from None
 
 
 def _progress() -> Progress:

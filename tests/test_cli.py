@@ -213,6 +213,23 @@ def test_eval_says_at_once_that_a_mesh_is_damaged(finished, tmp_path, monkeypatc
     assert_refused(ecslam("eval", folder), "mesh.ply: not a readable mesh", f"make it with: ecslam mesh {folder}")
 
 
+def test_eval_prints_its_figures_where_the_summary_cannot_be_written(finished, tmp_path, monkeypatch):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    (folder / "mesh.ply").unlink()
+    before = summary(folder)
+
+    def refuse(*_):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    done = ecslam("eval", folder)
+    assert done.code == 0, done.err
+    assert "ate_rmse_cm" in done.out
+    assert "could not be written into" in done.out
+    assert "summary.json (Read-only file system)" in done.out
+    assert summary(folder) == before
+
+
 def test_mesh_is_made_again_at_another_size(finished, tmp_path):
     sizes = []
     for voxel in (0.04, 0.08):
@@ -361,6 +378,30 @@ def test_unknown_rooms_and_mesh_formats(finished, tmp_path):
     assert_refused(ecslam("synth", "studio", tmp_path / "x"), "synthetic/studio")
     assert_refused(ecslam("mesh", finished, "--out", tmp_path / "mesh.stl"), "mesh.stl", ".ply")
     assert_refused(ecslam("mesh", finished, "--out", tmp_path / "no" / "mesh.ply"), "there is no folder", "no")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["kernels", "--json"], ["speed", "--json"], ["speed", "--plot"], ["viewers", "--json"], ["accuracy", "--json"]],
+)
+def test_where_results_cannot_go_is_found_before_a_benchmark_runs(tmp_path, words):
+    assert_refused(ecslam("bench", *words, tmp_path / "none/x"), f"{words[1]} {tmp_path / 'none/x'}", "no folder")
+    assert_refused(ecslam("bench", *words, tmp_path), f"{words[1]} {tmp_path}: a folder", "name of a file")
+
+
+def test_a_mesh_for_a_folder_that_takes_no_files_is_refused_before_it_is_made(finished, tmp_path, monkeypatch):
+    real = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: not mode & os.W_OK and real(path, mode))
+    monkeypatch.setattr(commands, "build_mesh", pytest.fail)
+    assert_refused(ecslam("mesh", finished), f"--out {finished / 'mesh.ply'}", f"cannot write in {finished}")
+    monkeypatch.undo()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    outcome = ecslam("mesh", finished, "--voxel", 0.2, "--out", tmp_path / "m.ply")
+    assert_refused(outcome, "m.ply: cannot be written (No space left on device)")
 
 
 def test_the_default_folder_is_a_new_one(tmp_path):

@@ -32,6 +32,16 @@ def require_space(folder: Path, needed_mb: float) -> None:
         )
 
 
+def require_place(file: Path, option: str) -> None:
+    """Make sure that ``file``, which ``option`` named, can be written. Raises InputError when not."""
+    if not file.parent.is_dir():
+        raise InputError(f"{option} {file}: there is no folder {file.parent}; make it first")
+    if file.is_dir():
+        raise InputError(f"{option} {file}: a folder; give the name of a file")
+    if not os.access(file.parent, os.W_OK | os.X_OK):
+        raise InputError(f"{option} {file}: cannot write in {file.parent}; give a file elsewhere")
+
+
 def beside(folder: Path) -> Path:
     """A folder that does not exist yet: ``runs/a`` -> ``runs/a-2`` -> ``runs/a-3``."""
     stem, dash, number = folder.name.rpartition("-")

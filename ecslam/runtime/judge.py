@@ -31,8 +31,8 @@ def judge_run(
 
     ate_*_cm, rpe_cm, rpe_deg and, where the sequence has a reference mesh, depth_l1_cm, accuracy_cm, completion_cm,
     completion_ratio (per cent). progress: gets the share done in 0..1. surface: False leaves out the latter, which
-    take a minute. tell: gets a sentence when some of them are missing. Raises InputError without a finished run or
-    ground truth, and for a mesh that is damaged.
+    take a minute. tell: gets a sentence when some of them are missing, or cannot be written. Raises InputError without
+    a finished run or ground truth, and for a mesh that is damaged.
     """
     summary_path = folder / "summary.json"
     try:
@@ -49,7 +49,10 @@ def judge_run(
         figures |= found
         if note:
             tell(note)
-    write_atomic(summary_path, json.dumps(summary | figures, indent=2).encode())
+    try:
+        write_atomic(summary_path, json.dumps(summary | figures, indent=2).encode())
+    except OSError as error:
+        tell(f"the figures could not be written into {summary_path} ({error.strerror})")
     return figures
 
 
