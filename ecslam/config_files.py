@@ -165,18 +165,18 @@ def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
         raise InputError(f"{source}: {prefix.rstrip('.') or 'the file'} must hold keys and values, not {_kind(values)}")
     hints = typing.get_type_hints(type(node))
     by_name = {f.name: f for f in fields(node)}
-    changes: dict[str, Any] = {}
+    laid: dict[str, Any] = {}
     for key, value in values.items():
         path = f"{prefix}{key}"
         if key not in by_name:
             raise InputError(f"{source}: unknown key {path!r}{_suggest(path, _all_keys(Config))}")
         current = getattr(node, key)
         if is_dataclass(current):
-            changes[key] = _apply(current, value, source, f"{path}.")
+            laid[key] = _apply(current, value, source, f"{path}.")
         else:
-            changes[key] = _convert(value, hints[key], by_name[key].metadata, source, path)
+            laid[key] = _convert(value, hints[key], by_name[key].metadata, source, path)
     try:
-        return dataclasses.replace(node, **changes)
+        return dataclasses.replace(node, **laid)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
 
