@@ -132,6 +132,7 @@ def flood(page, count):
 
 
 @needs_proc
+@pytest.mark.slow
 def test_a_viewer_that_reads_nothing_does_not_grow_the_memory(page, deaf):
     flood(page, 5)
     before = memory()

@@ -9,6 +9,7 @@ from ecslam.bench.kernels import bench_kernels, print_table
 from ecslam.types import InputError
 
 
+@pytest.mark.slow
 def test_ratios_are_those_of_the_medians():
     result = bench_kernels(rays=20, repeats=3, device="cpu")
     assert set(result["milliseconds"]) == {"mapping step", "tracking step", "values", "normal equations"}

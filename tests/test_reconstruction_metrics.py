@@ -281,6 +281,7 @@ def test_views_lie_in_the_middle_of_the_box_and_stand_upright() -> None:
 # ---- everything -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_that_is_right_gets_full_marks_and_the_same_ones_again() -> None:
     done: list[float] = []
     first = evaluate_run(room(), room(), CAMERA, turning(), samples=20_000, views=10, progress=done.append)
@@ -293,6 +294,7 @@ def test_a_run_that_is_right_gets_full_marks_and_the_same_ones_again() -> None:
     assert evaluate_run(room(), room(), CAMERA, turning(), samples=20_000, views=10) == first
 
 
+@pytest.mark.slow
 def test_a_world_that_is_slightly_off_is_registered_first() -> None:
     off = Similarity(Rotation.from_euler("z", 0.5, degrees=True).as_matrix(), np.array([0.02, -0.03, 0.01]))
     mesh = room()

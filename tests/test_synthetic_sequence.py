@@ -222,6 +222,7 @@ def test_a_wrong_address_is_one_clear_line(address, words):
     assert words in str(error.value)
 
 
+@pytest.mark.slow
 def test_written_replica_reads_back(tmp_path):
     sequence = open_synthetic("studio", **SMALL, frames=3)
     calls = []
