@@ -35,7 +35,7 @@ from ecslam.messages import (
 from ecslam.runtime.exports import zip_run
 from ecslam.runtime.feed import Feed, FeedSubscription
 from ecslam.runtime.mesh_files import mesh_bytes
-from ecslam.types import InputError
+from ecslam.types import InputError, words
 
 from .history import history_of
 from .past import Past
@@ -106,7 +106,7 @@ class ReplayEngine:
             try:
                 self._obey(*item)
             except Exception as problem:
-                error = str(problem) or type(problem).__name__
+                error = words(problem)
             self._feed.publish(Ack(*item, error))
 
     def _obey(self, number: int, command: Command) -> None:

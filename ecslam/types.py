@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.floating]
 
 
+def words(error: BaseException) -> str:
+    """What an error says, or its kind where it says nothing."""
+    return str(error) or type(error).__name__
+
+
 class InputError(Exception):
     """Something the user gave cannot be used. The message is one line: what is wrong, where, and what to do.
 

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from ..config import Config
 from ..config_files import for_layout, load_config, load_preset
 from ..messages import Snapshot
-from ..types import Sequence
+from ..types import Sequence, words
 
 Figures = dict[str, Any]
 
@@ -37,7 +37,7 @@ def in_own_process(job: Callable[..., Figures], arguments: tuple[Any, ...]) -> F
     except BrokenProcessPool:
         return {"error": "its process was killed, perhaps for lack of memory"}
     except Exception as error:
-        return {"error": str(error) or type(error).__name__}
+        return {"error": words(error)}
 
 
 @contextmanager

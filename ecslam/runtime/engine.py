@@ -18,7 +18,7 @@ from typing import Any
 from .. import config_files, datasets
 from ..config import Config
 from ..messages import Command, Event, Export, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
-from ..types import Frame, FrameError, InputError, Sequence
+from ..types import Frame, FrameError, InputError, Sequence, words
 from .ahead import preparation
 from .checkpoint import Checkpoint, load_checkpoint
 from .control import Control, Turn
@@ -222,7 +222,7 @@ class Engine:
         except Exception as error:
             self._failed(error)
         if self.error is not None:
-            self._show(State.FAILED, _words(self.error))
+            self._show(State.FAILED, words(self.error))
         elif turn is Turn.STOP:
             self._show(State.FINISHED)
         return turn
@@ -299,7 +299,7 @@ class Engine:
     def _failed(self, error: Exception) -> None:
         error = out_of_memory(error, self._run.config, self._run.plan.device) or error
         self.error = self.error or error
-        self._run.notice("error", _words(error))
+        self._run.notice("error", words(error))
 
     def _show(self, state: State, reason: str = "") -> None:
         self._next_snapshot = monotonic() + (WATCHED_PERIOD_S if self._feed.watched else UNWATCHED_PERIOD_S)
@@ -330,7 +330,3 @@ class Engine:
         self._feed.publish(event)
         if isinstance(event, Notice):
             self._tell(event)
-
-
-def _words(error: Exception) -> str:
-    return str(error) or type(error).__name__

@@ -11,7 +11,7 @@ from .. import config_files
 from ..evaluation.trajectory_io import format_kitti, format_tum
 from ..meshing import MeshingStopped
 from ..messages import Event, Export, Exported, FramePictures
-from ..types import InputError
+from ..types import InputError, words
 from .mesh_files import mesh_bytes
 from .meshjobs import FrozenMap, build_mesh
 from .pictures import shrink, shrink_depth, six_pictures
@@ -43,7 +43,7 @@ def export_job(
         except MeshingStopped:
             raise
         except Exception as problem:
-            error = str(problem) or type(problem).__name__
+            error = words(problem)
         publish(Exported(export.kind, str(path or ""), command_id, error or run.folder.not_saved.get(name, "")))
 
     return job

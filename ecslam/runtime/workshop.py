@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..messages import Command, Export, Exported, MeshReady, Notice, RequestMesh, RequestPictures
-from ..types import Frame, InputError
+from ..types import Frame, InputError, words
 from .control import Control
 from .exports import export_job, render_pictures
 from .feed import Feed
@@ -64,7 +64,7 @@ class Workshop:
                 elif isinstance(command, Export):
                     self._jobs.submit(export_job(run, command, command_id, frozen, self._feed.publish, self._leaving))
             except Exception as error:
-                why = str(error) or type(error).__name__
+                why = words(error)
                 if isinstance(command, Export):
                     self._feed.publish(Exported(command.kind, "", command_id, why))
                 else:
@@ -117,7 +117,7 @@ class Workshop:
             frozen = run.freeze()
             self.live(run, at_once=True)
         except Exception as error:
-            run.warn(_without_mesh(run, f" ({(str(error) or type(error).__name__).splitlines()[0]})"))
+            run.warn(_without_mesh(run, f" ({words(error).splitlines()[0]})"))
             return
         if frozen is None:
             return
