@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .kernels import Backend, reference
+from .kernels import Backend, PoseMoments, reference
 
 BETA2, EPSILON = 0.999, 1e-8
 
@@ -33,14 +33,12 @@ class PoseAdam:
         about: Tensor | None = None,
         kernels: Backend = reference,
     ) -> None:
-        self.c2w, self._rates, self._decays, self._about = c2w, rates, (momentum, BETA2), about
-        self._mean, self._square = torch.zeros_like(rates), torch.zeros_like(rates)
+        self.c2w, self._rates = c2w, rates
+        self._moments = PoseMoments(torch.zeros_like(rates), torch.zeros_like(rates), about, (momentum, BETA2), EPSILON)
         self._count, self._kernels = 0, kernels
 
     def step(self, d_c2w: Tensor, share: float | Tensor | None = None) -> None:
         """One update from gradients [P, 3, 4] at ``share`` of the learning rates; None: at all of them."""
         self._count += 1
-        moments, rates = (self._mean, self._square), self._rates if share is None else share * self._rates
-        self.c2w = self._kernels.pose_step(
-            self.c2w, d_c2w, *moments, rates, self._about, self._decays, EPSILON, self._count
-        )
+        rates = self._rates if share is None else share * self._rates
+        self.c2w = self._kernels.pose_step(self.c2w, d_c2w, self._moments, rates, self._count)

@@ -27,7 +27,7 @@ from on_gpu import DEVICE, INTERPRETED, moved, run
 
 from ecslam.config import FieldConfig
 from ecslam.field import grow_field
-from ecslam.kernels import FieldParams, gpu, reference
+from ecslam.kernels import FieldParams, PoseMoments, gpu, reference
 from ecslam.kernels.poses_gpu import pose_step
 from ecslam.pose_adam import BETA2, EPSILON, PoseAdam
 
@@ -227,9 +227,10 @@ def test_a_step_of_the_poses(poses, about):
     mean, square = torch.zeros(poses, 6).double(), torch.zeros(poses, 6).double()
     there = [moved(t, DEVICE) for t in (found, mean, square, rates, centre)]
     found, mean, square, rates, centre = there
+    moments = PoseMoments(mean, square, centre, (0.5, BETA2), EPSILON)
     for count in range(1, 4):
         gradient = torch.randn(poses, 3, 4, generator=g)
         expected.step(gradient)
-        found = pose_step(found, gradient.to(DEVICE), mean, square, rates, centre, (0.5, BETA2), EPSILON, count)
+        found = pose_step(found, gradient.to(DEVICE), moments, rates, count)
     torch.testing.assert_close(found.cpu(), expected.c2w, rtol=0, atol=1e-8)
     assert poses == 1 or (found.cpu() - c2w).abs().max() > 0.01

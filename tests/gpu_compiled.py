@@ -20,7 +20,7 @@ from triton.runtime.jit import JITFunction
 from ecslam.config import FieldConfig
 
 torch.cuda.is_available, available = lambda: True, torch.cuda.is_available
-from ecslam.kernels import Rules, fusion_gpu, gpu  # noqa: E402
+from ecslam.kernels import PoseMoments, Rules, fusion_gpu, gpu  # noqa: E402
 
 torch.cuda.is_available = available
 LAUNCH = JITFunction.run
@@ -55,8 +55,9 @@ def launch_the_map(variants):
     gpu.step(layout, params, c2w, rays, WEIGHTS, blank(params), True)
     gpu.normal_equations(layout, params, c2w[0], points, points[:, 0].contiguous(), ALIGN)
     poses = torch.eye(4).double().repeat(30, 1, 1)
-    moments = [torch.zeros(30, 6).double() for _ in range(3)]
-    gpu.pose_step(poses, torch.zeros(30, 3, 4), *moments, torch.zeros(30, 3).double(), (0.5, 0.9), 1e-8, 1)
+    mean, square, rates = (torch.zeros(30, 6).double() for _ in range(3))
+    moments = PoseMoments(mean, square, torch.zeros(30, 3).double(), (0.5, 0.9), 1e-8)
+    gpu.pose_step(poses, torch.zeros(30, 3, 4), moments, rates, 1)
     if variants:
         gpu.values(layout, params, points)
         gpu.step(layout, params, c2w, rays, WEIGHTS, None, True)

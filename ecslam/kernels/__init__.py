@@ -24,6 +24,7 @@ from .types import (
     FieldParams,
     GridLayout,
     NormalEquations,
+    PoseMoments,
     RayBatch,
     Rules,
     StepResult,
@@ -37,6 +38,7 @@ __all__ = [
     "FieldParams",
     "GridLayout",
     "NormalEquations",
+    "PoseMoments",
     "RayBatch",
     "Rules",
     "StepResult",
@@ -93,18 +95,7 @@ class Backend(Protocol):
         """Sums for one Gauss-Newton step."""
         ...
 
-    def pose_step(
-        self,
-        c2w: Tensor,
-        d_c2w: Tensor,
-        mean: Tensor,
-        square: Tensor,
-        rates: Tensor,
-        about: Tensor | None,
-        decays: tuple[float, float],
-        epsilon: float,
-        count: int,
-    ) -> Tensor:
+    def pose_step(self, c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, count: int) -> Tensor:
         """Poses [P, 4, 4] after one step of Adam."""
         ...
 

@@ -36,7 +36,7 @@ from ._cpu_work import (
     table_worker,
     values_worker,
 )
-from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
+from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, PoseMoments, RayBatch, StepResult, Weights
 
 drop_stale(Path(__file__).parent, step_worker.stats.cache_path, "_cpu_*")
 
@@ -204,7 +204,7 @@ def step(
     net, grid, batch = _net(layout, params), _grid(layout), _rays(c2w, rays)
     kept = chunks if into is not None else 0
     threads, keep, buffers = _buffers(kept, count * samples, CHUNK_RAYS * samples, net.padded)
-    w = np.array([getattr(weights, name) for name in Weights.__dataclass_fields__], np.float32)
+    w = np.array(weights.numbers(), np.float32)
     groups = min(GROUPS, chunks)
     losses, sums = np.zeros((groups, 5)), _workspace.array("sums", count, 6)
     partial = _workspace.array("partial", groups, net.padded * BOTH + net.blob.size + 4 * HALF + 1)
@@ -256,21 +256,11 @@ def normal_equations(
     )
 
 
-def pose_step(
-    c2w: Tensor,
-    d_c2w: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    rates: Tensor,
-    about: Tensor | None,
-    decays: tuple[float, float],
-    epsilon: float,
-    count: int,
-) -> Tensor:
+def pose_step(c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, count: int) -> Tensor:
     """See ``reference.pose_step``."""
     moved = torch.empty_like(c2w)
-    turned_about = np.empty((0, 3)) if about is None else about.numpy()
+    about = np.empty((0, 3)) if moments.about is None else moments.about.numpy()
     poses, pulls = c2w.contiguous().numpy(), d_c2w.contiguous().numpy()
-    state = mean.numpy(), square.numpy(), rates.contiguous().numpy()
-    pose_worker(poses, pulls, *state, turned_about, decays, epsilon, count, moved.numpy())
+    state = moments.mean.numpy(), moments.square.numpy(), rates.contiguous().numpy()
+    pose_worker(poses, pulls, *state, about, moments.decays, moments.epsilon, count, moved.numpy())
     return moved

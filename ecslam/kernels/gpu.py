@@ -212,7 +212,7 @@ def _step(
     slopes = None if d_c2w is None else beta.new_empty(3, *of_features)
     sdf, rgb = _evaluate(layout, field, placed, Kept(features, slopes, hidden))
     grid, sizes = _ray_grid(targets.rays, targets.samples)
-    numbers = tuple(float(getattr(weights, name)) for name in Weights.__dataclass_fields__)
+    numbers = weights.numbers()
     d_beta = beta if into is None else into.beta
     losses_kernel[grid](targets, sdf, rgb, beta, numbers, losses, d_beta, want_beta=into is not None, **sizes)
     if into is None and d_c2w is None:

@@ -16,6 +16,7 @@ from .types import (
     FieldParams,
     GridLayout,
     NormalEquations,
+    PoseMoments,
     RayBatch,
     StepResult,
     Weights,
@@ -219,24 +220,14 @@ def normal_equations(
     return NormalEquations(jtj, jtr, cost, int(keep.sum()), inliers)
 
 
-def pose_step(
-    c2w: Tensor,
-    d_c2w: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    rates: Tensor,
-    about: Tensor | None,
-    decays: tuple[float, float],
-    epsilon: float,
-    count: int,
-) -> Tensor:
+def pose_step(c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, count: int) -> Tensor:
     """Poses float64 [P, 4, 4] after step ``count`` (from 1 on) of Adam in the tangent of ``se3.retract``.
 
-    d_c2w: gradients [P, 3, 4]. mean, square: moments float64 [P, 6], brought up to date. rates: float64 [P, 6]. about:
-    float64 [P, 3], in camera coordinates, what the poses turn about; None: the cameras. decays, epsilon: Adam's.
+    d_c2w: gradients [P, 3, 4]. rates: float64 [P, 6].
     """
-    gradient = se3.tangent_gradient(c2w, d_c2w.to(c2w.dtype), about)
+    mean, square, decays = moments.mean, moments.square, moments.decays
+    gradient = se3.tangent_gradient(c2w, d_c2w.to(c2w.dtype), moments.about)
     mean.mul_(decays[0]).add_(gradient, alpha=1 - decays[0])
     square.mul_(decays[1]).addcmul_(gradient, gradient, value=1 - decays[1])
     first, second = mean / (1 - decays[0] ** count), square / (1 - decays[1] ** count)
-    return se3.retract(c2w, -rates * first / (second.sqrt() + epsilon), about)
+    return se3.retract(c2w, -rates * first / (second.sqrt() + moments.epsilon), moments.about)

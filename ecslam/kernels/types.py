@@ -81,7 +81,16 @@ class RayBatch:
 
 
 @dataclass(frozen=True)
-class Weights:
+class Numbers:
+    """Settings that kernels take as plain numbers."""
+
+    def numbers(self) -> tuple[float, ...]:
+        """The fields, in order."""
+        return tuple(float(getattr(self, f.name)) for f in fields(self))
+
+
+@dataclass(frozen=True)
+class Weights(Numbers):
     """Loss weights and the two lengths the losses need (metres). Paper, equations 4 to 7."""
 
     free_space: float
@@ -108,7 +117,7 @@ class StepResult:
 
 
 @dataclass(frozen=True)
-class AlignSettings:
+class AlignSettings(Numbers):
     """What the direct alignment of points to the TSDF needs.
 
     truncation_m: metres per TSDF unit. kernel_m, colour_kernel: scales of the Geman-McClure weights (metres; luminance
@@ -124,10 +133,6 @@ class AlignSettings:
     colour_weight: float
     colour_kernel: float
 
-    def numbers(self) -> tuple[float, ...]:
-        """The fields, in order."""
-        return tuple(float(getattr(self, name)) for name in self.__dataclass_fields__)
-
 
 class Rules(NamedTuple):
     """When a descent takes a step and when a stage of it ends. damping: at first; settled: share of the cost that a
@@ -141,6 +146,19 @@ class Rules(NamedTuple):
     still_after_gain: float
     still_after_loss: float
     least_used: int
+
+
+@dataclass(frozen=True)
+class PoseMoments:
+    """What Adam keeps of P poses between steps, in the tangent of ``se3.retract``. mean, square: float64 [P, 6],
+    brought up to date by each step. about: float64 [P, 3], in camera coordinates, what the poses turn about; None: the
+    cameras. decays, epsilon: Adam's."""
+
+    mean: Tensor
+    square: Tensor
+    about: Tensor | None
+    decays: tuple[float, float]
+    epsilon: float
 
 
 @dataclass(frozen=True)
