@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import struct
 import time
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ecslam.datasets import images
 from ecslam.datasets.images import NO_DEPTH, read_color, read_depth, read_header, to_metres
 from ecslam.types import FrameError
 
@@ -131,6 +134,18 @@ def test_any_bytes_are_a_frame_error(tmp_path: Path, start: bytes, rest: bytes) 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+@pytest.mark.parametrize("version", [4, 5])
+def test_opencv_keeps_quiet_in_both_versions(monkeypatch: pytest.MonkeyPatch, version: int) -> None:
+    levels: list[int] = []
+    if version == 4:
+        monkeypatch.delattr(cv2.utils, "logging", raising=False)
+        monkeypatch.setattr(cv2, "setLogLevel", levels.append, raising=False)
+    else:
+        monkeypatch.setattr(cv2.utils, "logging", SimpleNamespace(setLogLevel=levels.append), raising=False)
+    importlib.reload(images)
+    assert levels == [0]
 
 
 def test_pixels_that_cannot_be_unpacked_are_a_frame_error(tmp_path: Path) -> None:
