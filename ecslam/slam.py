@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,6 +88,7 @@ class Slam:
         self._loops = LoopDetector()
         self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
         self._pending: Future[Mapped] | None = None
+        self._stream = torch.cuda.Stream(self.device) if self._pool and self.device.type == "cuda" else None
         self._landed = Landed()
         self._frozen: TsdfField | None = None
         self._note, self._graphs_failed = "", False
@@ -194,7 +196,9 @@ class Slam:
         window, iterations = self._choose_window(), self.config.mapping.iterations
         old = self._loops.update(self.trajectory.keyframe_poses(), self.trajectory[-1])
         if self._pool is not None and len(old) == 0:
-            self._pending = self._pool.submit(self._optimise, window, iterations, None)
+            if self._stream is not None:
+                self._stream.wait_stream(torch.cuda.current_stream(self.device))
+            self._pending = self._pool.submit(self._beside, window, iterations)
             return None
         centres, before = self.trajectory.poses()[:, :3, 3].astype(np.float32), self.trajectory[-1]
         mapped = self._optimise(window, iterations, interrupt)
@@ -228,6 +232,11 @@ class Slam:
         poses = self.trajectory.keyframe_poses()[window]
         result = self.mapper.run(views, poses, window == 0, iterations, self.config, interrupt, smooth)
         return Mapped(window, result, time.perf_counter() - began)
+
+    def _beside(self, window: NDArray[np.int64], iterations: int) -> Mapped:
+        """What the second thread does; on a GPU in a stream of its own, or tracking would queue up behind it."""
+        with torch.cuda.stream(self._stream) if self._stream is not None else nullcontext():
+            return self._optimise(window, iterations, None)
 
     def _apply(self, mapped: Mapped, beside_s: float = 0.0) -> None:
         window, result = mapped.window, mapped.result
