@@ -7,10 +7,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .kernels.reference import PRIMES
 from .observed import VOXEL_M, ObservedVoxels
 
 SLOTS = 1 << 22  # of a byte; a room marks one in a hundred, so as many unobserved voxels pass
-PRIMES = (1, 2654435761, 805459861)
 
 
 class ObservedTable:
@@ -26,10 +26,6 @@ class ObservedTable:
         points, pose = (torch.from_numpy(a).to(self.marks.device, non_blocking=True) for a in (local, c2w))
         self.marks[self._slots(points.double() @ pose[:3, :3].mT + pose[:3, 3])] = True
 
-    def contains(self, points: Tensor) -> Tensor:
-        """Whether each world point [N, 3] lies in a marked voxel: bool [N]."""
-        return self.marks[self._slots(points)]
-
     def state(self) -> dict[str, NDArray[np.int64]]:
         """That of ``ObservedVoxels`` before the first view: the views are added again."""
         return ObservedVoxels().state()
@@ -38,6 +34,7 @@ class ObservedTable:
         """Nothing: see ``state``."""
 
     def _slots(self, points: Tensor) -> Tensor:
+        """Where the voxels of world points [N, 3] have their marks: int64 [N]."""
         cell = torch.floor(points / VOXEL_M).long()
         x, y, z = (cell[:, i] * prime for i, prime in enumerate(PRIMES))
         return (x ^ y ^ z) & (SLOTS - 1)

@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config
+from .kernels import tracking_gpu
+from .kernels.tracking_gpu import Cells, Lens, Marks
+from .observed import LEAST_KNOWN, VOXEL_M
+from .observed_gpu import ObservedTable
 from .pixels import LUMINANCE, border_of, feature_points, grid_shape
 from .rays import DevicePixels
 from .types import Frame, Intrinsics
@@ -47,60 +51,42 @@ def grid_cells(frame: DeviceFrame, count: int, config: Config) -> int:
     return rows * columns
 
 
-def spread(frame: DeviceFrame, camera: Intrinsics, count: int, config: Config, jitter: Tensor) -> DevicePixels:
-    """A pixel in each cell of the uniform grid of about ``count``. jitter: [grid_cells, 2] in 0..1."""
-    cell = torch.arange(len(jitter), device=jitter.device)
-    return _read(frame, camera, _in_cells(frame, cell, count, config, jitter), torch.zeros_like(cell).bool(), config)
+def spread(frame: DeviceFrame, camera: Intrinsics, count: int, config: Config, jitter: Tensor) -> Tensor:
+    """The points of a pixel in each cell of the uniform grid of about ``count``: see ``tracking_gpu.spread``. jitter:
+    [grid_cells, 2] in 0..1."""
+    cells, luminance = _cells(frame, count, config), tuple(map(float, LUMINANCE))
+    return tracking_gpu.spread(frame.color, frame.depth, jitter, cells, _lens(camera, config), luminance)
 
 
 def choose(
-    frame: DeviceFrame, camera: Intrinsics, config: Config, corners: Tensor, order: Tensor, jitter: Tensor
+    frame: DeviceFrame,
+    camera: Intrinsics,
+    config: Config,
+    corners: Tensor,
+    order: Tensor,
+    jitter: Tensor,
+    observed: ObservedTable,
+    c2w: Tensor,
 ) -> DevicePixels:
-    """As many pixels as there are rows of ``jitter`` [N, 3] in 0..1. With FUS the first ones are the ``corners`` [C] of
-    the frame (-1: none), the rest come from the uniform grid, some of whose cells go without; without FUS all are
-    uniform random. order: the cells of that grid [grid_cells], shuffled."""
-    count, (height, width) = len(jitter), frame.depth.shape
-    if not config.fus:
-        border = border_of(config, height, width)
-        v = border + (jitter[:, 0] * (height - 2 * border)).long()
-        u = border + (jitter[:, 1] * (width - 2 * border)).long()
-        return _read(frame, camera, v * width + u, torch.zeros_like(u).bool(), config)
-    start = (jitter[0, 2] * len(order)).long()
-    cell = order[(torch.arange(count, device=order.device) + start) % len(order)]
-    index = _in_cells(frame, cell, count, config, jitter)
-    corners = torch.nn.functional.pad(corners, (0, count - len(corners)), value=-1)
-    feature = corners >= 0
-    return _read(frame, camera, torch.where(feature, corners, index), feature, config)
+    """As many pixels as there are rows of ``jitter`` [N, 3] in 0..1, all where the map has been ``observed``, seen from
+    c2w [4, 4], some more than once; with a depth at least where that leaves too few. With FUS the first ones are the
+    ``corners`` [C] of the frame (-1: none), the rest come from the uniform grid, some of whose cells go without;
+    without FUS all are uniform random. order: the cells of that grid [grid_cells], shuffled."""
+    cells = _cells(frame, len(jitter) if config.fus else 1, config)
+    found = tracking_gpu.chosen(
+        frame.color, frame.depth, jitter, corners, order if config.fus else None, cells, _lens(camera, config),
+        Marks(observed.marks.view(torch.uint8), len(observed.marks), VOXEL_M), c2w, LEAST_KNOWN,
+    )  # fmt: skip
+    return DevicePixels(found.direction, found.depth, found.color, found.feature.view(torch.bool))
 
 
-def light_of(pixels: DevicePixels) -> Tensor:
-    """Luminance [N] in 0..1."""
-    (red, green, blue), (r, g, b) = pixels.color.float().unbind(1), LUMINANCE.tolist()
-    return r * red + g * green + b * blue
+def _lens(camera: Intrinsics, config: Config) -> Lens:
+    return Lens(camera.fx, camera.fy, camera.cx, camera.cy, config.depth_near_m, config.depth_far_m)
 
 
-def compacted(keep: Tensor) -> tuple[Tensor, Tensor]:
-    """The indices [N] at which ``keep`` [N] is true, in order, then rubbish; and how many there are []."""
-    count, place = keep.sum(), keep.cumsum(0) - 1
-    out = place.new_zeros(len(keep) + 1)
-    out[torch.where(keep, place, len(keep))] = torch.arange(len(keep), device=keep.device)
-    return out[:-1], count
-
-
-def _in_cells(frame: DeviceFrame, cell: Tensor, count: int, config: Config, jitter: Tensor) -> Tensor:
+def _cells(frame: DeviceFrame, count: int, config: Config) -> Cells:
     height, width = frame.depth.shape
     border = border_of(config, height, width)
     h, w = height - 2 * border, width - 2 * border
     rows, columns = grid_shape(h, w, count)
-    v = ((cell // columns + jitter[:, 0]) * (h / rows)).long().clamp_max(h - 1) + border
-    u = ((cell % columns + jitter[:, 1]) * (w / columns)).long().clamp_max(w - 1) + border
-    return v * width + u
-
-
-def _read(frame: DeviceFrame, camera: Intrinsics, index: Tensor, feature: Tensor, config: Config) -> DevicePixels:
-    v, u = index // frame.depth.shape[1], index % frame.depth.shape[1]
-    one = torch.ones_like(index, dtype=torch.float32)
-    direction = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, one], 1)
-    depth = frame.depth.view(-1)[index]
-    sound = (depth >= config.depth_near_m) & (depth <= config.depth_far_m)
-    return DevicePixels(direction, torch.where(sound, depth, 0.0), frame.color.view(-1, 3)[index], feature)
+    return Cells(width, border, columns, h - 1, w - 1, h / rows, w / columns)

@@ -18,19 +18,19 @@ from .align import LEAST_KNOWN, stages
 from .config import Config
 from .descent import COARSE_STRIDE, RULES, outlier_cost
 from .field import TsdfField
-from .kernels import LOSS_NAMES, AlignSettings, Backend, RayBatch, fusion_gpu
+from .kernels import LOSS_NAMES, AlignSettings, Backend, RayBatch, fusion_gpu, tracking_gpu
 from .kernels._gpu_blocks import Blocks
+from .kernels._gpu_descent import COUNT
 from .kernels.graphs import Recorder
+from .kernels.tracking_gpu import TOLD
 from .observed_gpu import ObservedTable
-from .pixels_gpu import DeviceFrame, choose, compacted, grid_cells, light_of, padded_corners, spread
+from .pixels_gpu import DeviceFrame, choose, grid_cells, padded_corners, spread
 from .pose_adam import pose_rates
 from .rays import DevicePixels, kernel_weights, make_rays
 from .samples import uniform
 from .tracker import LEAST_POINTS, LEAST_SEEN, TrackResult, descend_rendered
 from .types import Frame, Intrinsics
 from .volume_gpu import GpuVolume
-
-HEADER = 15  # numbers of a result before the loss terms: pose [3, 4], cost, fit, points
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class GpuTracker:
             key=None,
             over=(config, field, self.volume.blocks),
         )
-        pose, (cost, fit, usable), terms = np.split(found.cpu().numpy(), [12, HEADER])
+        pose, (cost, fit, usable), terms = np.split(found.cpu().numpy(), [12, TOLD])
         if usable < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
         losses = dict(zip(LOSS_NAMES, terms.tolist(), strict=True)) if rays else {"align_mm": 1e3 * cost**0.5}
@@ -80,41 +80,22 @@ class GpuTracker:
         rates: Tensor,
         numbers: Tensor,
     ) -> tuple[Tensor]:
-        """Everything as a function of tensors: float64 [HEADER, and the loss terms where frames are rendered]."""
+        """Everything as a function of tensors: float64 [TOLD, and the loss terms where frames are rendered]."""
         frame, a, settings = DeviceFrame(color, depth), config.align, tuple(stages(config))
         cells = grid_cells(frame, a.points, config)
-        measured = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2))
-        packed, count = self._packed(blocks, measured, start)
-        row = fusion_gpu.descend(
-            blocks, packed, fusion_gpu.pack_start(start, count), settings, a.iterations, COARSE_STRIDE, RULES
-        )
-        (pose, cost), terms = fusion_gpu.unpack_pose(row), start.new_empty(0)
+        points = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2))
+        packed, first = tracking_gpu.packed(blocks, points, start, LEAST_KNOWN)
+        row = fusion_gpu.descend(blocks, packed, first, settings, a.iterations, COARSE_STRIDE, RULES)
+        pose, terms = row, start.new_empty(0)
         if config.tracking.iterations:
+            aligned, cost = fusion_gpu.unpack_pose(row)
             jitter = numbers[2 * cells :].view(config.tracking.rays, -1)
-            pixels = self._known(choose(frame, self.camera, config, corners, order, jitter[:, :3].contiguous()), pose)
-            rendered, terms = self._rendered(field, config, pixels, pose, rates, jitter[:, 3:])
-            costs = [_objective(blocks, packed, c2w, count, settings[-1]) for c2w in (pose, rendered)]
-            pose = torch.where(costs[1] <= costs[0], rendered, pose)
-        fit, usable = self._fit(blocks, measured, pose, 0.5 * config.truncation_m)
-        return (
-            torch.cat([pose[:3].reshape(12), torch.stack([cost / count.clamp_min(1), fit, usable]), terms.double()]),
-        )
-
-    def _packed(self, blocks: Blocks, measured: DevicePixels, start: Tensor) -> tuple[Tensor, Tensor]:
-        """Points and luminance [N, 4], those first that are to be aligned, and how many these are: see
-        ``align.known_points``."""
-        has, local = measured.depth > 0, measured.direction * measured.depth[:, None]
-        known = has & ~fusion_gpu.distances(blocks, _moved(start, local)).isnan()
-        index, count = compacted(torch.where(known.sum() >= LEAST_KNOWN, known, has))
-        return torch.cat([local, light_of(measured)[:, None]], 1)[index], count
-
-    def _known(self, pixels: DevicePixels, c2w: Tensor) -> DevicePixels:
-        """As many pixels, all of them where the map has been observed, some more than once; with a depth at least
-        where that leaves too few."""
-        has = pixels.depth > 0
-        known = has & self.observed.contains(_moved(c2w, pixels.direction * pixels.depth[:, None]))
-        index, count = compacted(torch.where(known.sum() >= LEAST_KNOWN, known, has))
-        return pixels.take(index[torch.arange(len(index), device=index.device) % count.clamp_min(1)])
+            pixels = choose(frame, self.camera, config, corners, order, jitter[:, :3], self.observed, aligned)
+            rendered, terms = self._rendered(field, config, pixels, aligned, rates, jitter[:, 3:])
+            worse = _objective(blocks, packed, rendered, row[COUNT.value], settings[-1]) > cost
+            pose = torch.where(worse, aligned, rendered)
+        told = tracking_gpu.told(blocks, points, pose, row, 0.5 * config.truncation_m, LEAST_SEEN)
+        return (torch.cat([told, terms.double()]) if len(terms) else told,)
 
     def _rendered(
         self, field: TsdfField, config: Config, pixels: DevicePixels, c2w: Tensor, rates: Tensor, jitter: Tensor
@@ -127,14 +108,6 @@ class GpuTracker:
         best, terms = descend_rendered(field, self.kernels, weights, t.iterations, t.momentum, c2w[None], rates, *batch)
         return best[0], terms
 
-    def _fit(self, blocks: Blocks, measured: DevicePixels, c2w: Tensor, near_m: float) -> tuple[Tensor, Tensor]:
-        """See ``tracker.fit``; and how many points were measured."""
-        has = measured.depth > 0
-        distance = fusion_gpu.distances(blocks, _moved(c2w, measured.direction * measured.depth[:, None]))
-        known = has & ~distance.isnan()
-        share = (known & (distance.abs() < near_m)).sum() / known.sum().clamp_min(1).double()
-        return torch.where(known.sum() < LEAST_SEEN * has.sum().clamp_min(1), 0.0, share), has.sum().double()
-
 
 @cache
 def _rates(lr_rotation: float, lr_translation: float, device: torch.device) -> Tensor:
@@ -144,12 +117,6 @@ def _rates(lr_rotation: float, lr_translation: float, device: torch.device) -> T
 @cache
 def _shuffled(count: int, device: torch.device) -> Tensor:
     return torch.randperm(count, generator=torch.Generator().manual_seed(0)).to(device, non_blocking=True)
-
-
-def _moved(c2w: Tensor, local: Tensor) -> Tensor:
-    """Camera points [N, 3] in the world, float64: sums of three products, not a matrix product for such small sizes."""
-    x, y, z = local.double().unbind(1)
-    return torch.stack([x * row[0] + y * row[1] + z * row[2] + row[3] for row in c2w[:3]], 1)
 
 
 def _objective(blocks: Blocks, packed: Tensor, c2w: Tensor, count: Tensor, settings: AlignSettings) -> Tensor:

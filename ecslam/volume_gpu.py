@@ -106,7 +106,7 @@ class GpuVolume:
     def distances(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """See ``FusedVolume.distances``; 0 where nothing is known."""
         at = self._upload(torch.from_numpy(np.ascontiguousarray(points, np.float64)))
-        found = fusion_gpu.distances(self.blocks, at).cpu().numpy()
+        found = fusion_gpu.distances(self.blocks, at, torch.eye(4, dtype=at.dtype, device=at.device)).cpu().numpy()
         known = ~np.isnan(found)
         return np.where(known, found, np.float32(0)), known
 

@@ -20,7 +20,7 @@ from triton.runtime.jit import JITFunction
 from ecslam.config import FieldConfig
 
 torch.cuda.is_available, available = lambda: True, torch.cuda.is_available
-from ecslam.kernels import PoseMoments, Rules, fusion_gpu, gpu  # noqa: E402
+from ecslam.kernels import PoseMoments, Rules, fusion_gpu, gpu, tracking_gpu  # noqa: E402
 
 torch.cuda.is_available = available
 LAUNCH = JITFunction.run
@@ -64,14 +64,23 @@ def launch_the_map(variants):
 
 
 def launch_the_volume():
-    """Everything that ``fusion_gpu`` launches."""
+    """Everything that ``fusion_gpu`` and ``tracking_gpu`` launch."""
     blocks, listed = fusion_gpu.allocate(1 << 12, 0.02, 0.06, torch.device("cpu"))
     start, points = fusion_gpu.pack_start(torch.eye(4), 2000), torch.zeros(2048, 4)
     depth, color, numbers = torch.zeros(480, 640), torch.zeros(480, 640, 3, dtype=torch.uint8), torch.zeros(19).double()
     fusion_gpu.enter(blocks, listed, torch.zeros(7, dtype=torch.int64))
     fusion_gpu.fuse(blocks, listed, depth, color, numbers, 4, 3)
-    fusion_gpu.distances(blocks, torch.zeros(7, 3).double())
+    fusion_gpu.distances(blocks, torch.zeros(7, 3).double(), torch.eye(4).double())
     fusion_gpu.descend(blocks, points, start, (ALIGN, ALIGN), 2, 4, Rules(1e-4, 1e-8, 1e4, 1e-4, 0, 0, 6))
+    cells, lens = tracking_gpu.Cells(640, 20, 64, 439, 599, 9.1, 9.3), tracking_gpu.Lens(500, 500, 320, 240, 0.1, 8.0)
+    pose, luminance = torch.eye(4).double(), (1e-3, 2e-3, 3e-4)
+    spread = tracking_gpu.spread(color, depth, torch.zeros(3000, 2), cells, lens, luminance)
+    _, row = tracking_gpu.packed(blocks, spread, pose, 100)
+    tracking_gpu.told(blocks, spread, pose, row, 0.03, 0.1)
+    marks = tracking_gpu.Marks(torch.zeros(1 << 12, dtype=torch.uint8), 1 << 12, 0.05)
+    for order in (torch.zeros(3000, dtype=torch.int64), None):
+        given = torch.zeros(1000, 3), torch.zeros(200, dtype=torch.int64), order, cells, lens, marks, pose, 100
+        tracking_gpu.chosen(color, depth, *given)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from ecslam.align import align, known_points, stages
 from ecslam.config import AlignConfig, Config, FieldConfig, SamplingConfig, TrackingConfig
 from ecslam.descent import RULES, descend
 from ecslam.field import create_field
-from ecslam.kernels import LOSS_NAMES, fusion_gpu, gpu, poses_gpu, reference
+from ecslam.kernels import LOSS_NAMES, fusion_gpu, gpu, poses_gpu, reference, tracking_gpu
 from ecslam.kernels._gpu_descent import COST, COUNT, DAMPING, DONE, EQUATIONS, ROW, SIZE, step_kernel
 from ecslam.kernels.graphs import Recorder
 from ecslam.observed import ObservedVoxels
@@ -27,7 +27,7 @@ from ecslam.observed_gpu import ObservedTable
 from ecslam.pixels import Points, spread_pixels
 from ecslam.pixels_gpu import DeviceFrame, grid_cells
 from ecslam.tracker import HostTracker
-from ecslam.tracker_gpu import HEADER, GpuTracker
+from ecslam.tracker_gpu import TOLD, GpuTracker
 from ecslam.types import Intrinsics
 from ecslam.volume import FusedVolume, create_volume
 from ecslam.volume_gpu import GpuVolume
@@ -332,7 +332,7 @@ def test_a_frame_without_depth_is_not_tracked(pair):
 @pytest.mark.parametrize("fus", [True, False])
 def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     """On the meta device no value can be read at all."""
-    for module in (fusion_gpu, gpu, poses_gpu):
+    for module in (fusion_gpu, gpu, poses_gpu, tracking_gpu):
         launch_nothing(monkeypatch, module)
     meta = torch.device("meta")
     config = replace(TINY, fus=fus, tracking=TrackingConfig(iterations=2, rays=60))
@@ -349,4 +349,4 @@ def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     tracker._whole(field, blocks, config, *given)  # uploads the layout, once
     with Forbidding():
         (found,) = tracker._whole(field, blocks, config, *given)
-    assert found.shape == (HEADER + len(LOSS_NAMES),)
+    assert found.shape == (TOLD + len(LOSS_NAMES),)

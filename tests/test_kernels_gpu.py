@@ -15,7 +15,7 @@ HERE = Path(__file__).parent
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("checks", ["gpu_checks.py", "gpu_volume_checks.py"])
+@pytest.mark.parametrize("checks", ["gpu_checks.py", "gpu_volume_checks.py", "gpu_tracking_checks.py"])
 def test_every_kernel_agrees_with_the_reference(checks):
     pytest.importorskip("triton", reason="Triton is not installed, so the GPU kernels are not checked")
     interpret = "0" if torch.cuda.is_available() else "1"

@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from . import fusion
-from ._gpu_points import triple
+from ._gpu_points import moved, triple
 
 EDGE, CELLS = tl.constexpr(fusion.EDGE), tl.constexpr(fusion.CELLS)
 SCALE = tl.constexpr(fusion.SCALE)
@@ -146,10 +146,14 @@ def sample(blocks, world, live):
 
 
 @triton.jit(do_not_specialize=["total"])
-def distances_kernel(blocks, points, distance, total, block: tl.constexpr):
-    """Signed distance [N] in metres at world points float64 [N, 3], NaN where it is unknown."""
+def distances_kernel(blocks, points, c2w, distance, total, width: tl.constexpr, block: tl.constexpr):
+    """Signed distance [N] in metres at points [N, width], seen from a pose c2w, NaN where it is unknown and, with a
+    width of 4, where the third coordinate is 0."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
-    found, _, known = sample(blocks, triple(points + 3 * i, live), live)
+    local = triple(points + width * i, live)
+    if width == 4:
+        live = live & (local[2] > 0)
+    found, _, known = sample(blocks, (moved(c2w, local, 0), moved(c2w, local, 1), moved(c2w, local, 2)), live)
     truncation = tl.load(blocks.lengths + 1).to(tl.float32)
-    tl.store(distance + i, tl.where(known, found[0] * truncation, float("nan")), live)
+    tl.store(distance + i, tl.where(known & live, found[0] * truncation, float("nan")), i < total)

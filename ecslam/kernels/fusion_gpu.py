@@ -83,12 +83,15 @@ def fuse(
         integrate_kernel[(INTEGRATING * processors(measured.device),)](blocks, listed, view)
 
 
-def distances(blocks: Blocks, points: Tensor) -> Tensor:
-    """Signed distance float32 [N] in metres at world points float64 [N, 3], NaN where it is unknown."""
+def distances(blocks: Blocks, points: Tensor, c2w: Tensor) -> Tensor:
+    """Signed distance float32 [N] in metres at points [N, 3] seen from c2w float64 [3 or 4, 4], NaN where it is
+    unknown. Points [N, 4] have something else in the last column, and NaN where their third coordinate is 0."""
     found = torch.empty(len(points), dtype=torch.float32, device=points.device)
     if len(points):
         with beside(points):
-            distances_kernel[_programs(len(points), POINTS)](blocks, points, found, len(points), block=POINTS)
+            distances_kernel[_programs(len(points), POINTS)](
+                blocks, points, c2w, found, len(points), width=points.shape[1], block=POINTS
+            )
     return found
 
 
