@@ -507,6 +507,11 @@ def test_undistortion_moves_a_pixel_to_where_the_ideal_camera_sees_it(tmp_path: 
     assert set(np.unique(frame.depth)) == {0.0, 1.0}
 
 
+def test_tum_frames_have_the_times_of_their_depth_images(tmp_path: Path) -> None:
+    times = open_sequence(write_tum(tmp_path)).timestamps()
+    np.testing.assert_allclose(times, 1305031102.011 + np.arange(N) / 30, atol=2e-6)
+
+
 def test_tum_drops_and_counts_what_has_no_partner(tmp_path: Path) -> None:
     root = write_tum(tmp_path)
     lines = (root / "depth.txt").read_text().splitlines(keepends=True)

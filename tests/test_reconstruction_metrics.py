@@ -218,6 +218,15 @@ def test_what_is_hidden_behind_a_wall_is_dropped_and_what_is_near_the_surface_is
     assert free.tolist() == [True, False, True, False, False, False]
 
 
+def test_a_point_is_judged_by_the_pixel_it_falls_nearest_to() -> None:
+    depth = np.full((CAMERA.height, CAMERA.width), 1.0, np.float32)
+    depth[30, 40], depth[31, 40], depth[30, 41] = 3, 5, 5
+    pixels = np.array([[39.6, 29.6], [40.4, 30.4], [40.6, 30.4], [40.4, 30.6], [39.4, 30.0]])
+    points = 4 * np.column_stack([(pixels - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones(5)])
+    seen = observed(points, np.eye(4)[None], CAMERA, lambda index: depth)
+    assert seen.tolist() == [False, False, True, True, False]
+
+
 def test_frames_are_spread_over_the_finite_poses() -> None:
     poses = np.tile(np.eye(4), (1000, 1, 1))
     poses[100:200] = np.nan

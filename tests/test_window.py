@@ -72,6 +72,13 @@ def test_random_window_holds_the_current_keyframe(count, seed):
     assert len(set(window.tolist())) == len(window) <= 30
 
 
+def test_random_windows_have_every_size_up_to_the_cap():
+    rng = np.random.default_rng(0)
+    windows = [random_window(60, 2000, WindowConfig(size=6), rng) for _ in range(300)]
+    assert {len(window) for window in windows} == {2, 3, 4, 5, 6}
+    assert len(np.unique(np.concatenate(windows))) == 60
+
+
 def test_revisit_needs_to_have_been_away():
     rule = RevisitRule(away=20)
     poses = circle(100)
