@@ -181,7 +181,7 @@ def test_a_missing_half_shows_in_completion_only() -> None:
     assert error.completion_ratio == pytest.approx(51, abs=2)
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(SEEDS)
 def test_registration_undoes_a_small_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)
