@@ -204,6 +204,8 @@ def test_snapshots_keep_a_row_for_each_frame_and_say_lost(tmp_path, monkeypatch)
     assert states[8] is State.TRACKING
     assert states[10] is State.MAPPING
     assert last.state is State.FINISHED
+    assert last.fov_y_rad == pytest.approx(2 * np.arctan(24 / 60))  # of 48 rows at 60 pixels
+    assert last.aspect == pytest.approx(64 / 48)
     assert [k.frame for k in last.keyframes] == [0, 5, 10]
     assert np.array_equal(last.keyframes[1].c2w, last.trajectory[5])
 
