@@ -7,14 +7,15 @@ import json
 import os
 import shutil
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from ecslam_app import server, theme
-from ecslam_app.geometry import best_side, overview, rotation_difference_deg, rotation_to, up_direction
+from ecslam_app.geometry import best_side, frustum_lines, overview, rotation_difference_deg, rotation_to, up_direction
 from ecslam_app.glb import simplify, to_glb, vertex_normals
-from ecslam_app.history import History, history_of
+from ecslam_app.history import History, discrepancy, history_of
 from ecslam_app.panels.compare import figures_table
 from ecslam_app.past import Past
 from ecslam_app.record import html_replay
@@ -258,6 +259,31 @@ def test_html_replay_is_one_file_without_addresses_of_others(replay, tmp_path):
 
 
 # ---- what is drawn ------------------------------------------------------------------------------------------------
+
+
+def test_a_frustum_is_as_wide_and_high_as_its_camera_sees():
+    c2w = np.eye(4)
+    c2w[:3, 3] = 5, 6, 7
+    lines = frustum_lines(c2w[None], 2 * np.arctan(0.5), 4 / 3, 2.0)
+    assert lines.shape == (8, 2, 3)
+    corners = np.unique(lines.reshape(-1, 3).round(4), axis=0) - c2w[:3, 3]
+    wanted = [[0, 0, 0], *([x, y, 2] for x in (-4 / 3, 4 / 3) for y in (-1, 1))]
+    assert np.allclose(sorted(corners.tolist()), sorted(wanted), atol=1e-4)
+
+
+def test_the_loop_timeline_credits_an_error_to_its_frame_however_many_there_are(replay):
+    truth = np.tile(np.eye(4), (1000, 1, 1))
+    angle = np.radians(0.01 * np.arange(1000))
+    turned = truth.copy()
+    turned[:, 0, 0] = turned[:, 2, 2] = np.cos(angle)
+    turned[:, 0, 2], turned[:, 2, 0] = np.sin(angle), -np.sin(angle)
+    truth[:, :3, :3] = truth[:, :3, :3] @ turned[::-1, :3, :3]
+    snapshot = replace(replay.latest(), trajectory=truth @ turned, trajectory_gt=truth)
+    title, frames, degrees = discrepancy(snapshot, 100)
+    assert "°" in title
+    assert len(frames) == 100
+    assert (frames[0], frames[-1]) == (0, 999)
+    assert np.allclose(degrees, 0.01 * frames, atol=1e-5)
 
 
 def test_glb_is_read_back_by_trimesh():
