@@ -347,6 +347,9 @@ def test_a_wall_is_looked_at_from_its_front_and_the_choice_lasts():
     turned = best_side(Mesh(wall.vertices, wall.faces[:, ::-1]), up)
     assert turned[0] < -0.7
     assert np.array_equal(best_side(room_mesh(0.3), up, side), side)
+    for degrees, stays in ((20, True), (35, True), (60, False), (180, False)):
+        before = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0])
+        assert np.array_equal(best_side(wall, up, before), before) == stays
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, -1, 0], [0.6, 0, 0.8]])

@@ -9,6 +9,7 @@ import torch
 from ecslam.config import Config, LossWeights, SamplingConfig
 from ecslam.pixels import Pixels
 from ecslam.rays import gather, kernel_weights, make_rays, upload, view_centre
+from ecslam.types import Intrinsics
 
 CONFIG = Config(sampling=SamplingConfig(uniform=8, near_depth=4), depth_far_m=6.0)
 BOX = torch.tensor([[-2.0, -2, -2], [2, 2, 2]])
@@ -57,6 +58,17 @@ def test_gathered_pixels_come_iteration_by_iteration():
     near, far = pixels([1.0, 2.0]), pixels([5.0, 6.0])
     found = gather([near, far], [np.array([[0, 1], [1, 1]]), np.array([[1], [0]])])
     assert found.depth.tolist() == [1, 2, 6, 2, 2, 5]
+
+
+@pytest.mark.parametrize("size", [(320, 240), (64, 48), (1280, 720)])
+def test_a_camera_of_another_size_sees_to_the_same_edges(size):
+    """Pixel centres lie at whole numbers, so an image reaches from -0.5 to its width - 0.5."""
+    camera = Intrinsics(517.3, 516.5, 318.6, 255.3, 640, 480)
+    other = camera.resized(*size)
+    for a, b in ((camera, other), (other, other.resized(640, 480))):
+        for share in (0, 0.3, 1):
+            assert (share * a.width - 0.5 - a.cx) / a.fx == pytest.approx((share * b.width - 0.5 - b.cx) / b.fx)
+            assert (share * a.height - 0.5 - a.cy) / a.fy == pytest.approx((share * b.height - 0.5 - b.cy) / b.fy)
 
 
 def test_a_weight_keeps_its_name():
