@@ -6,6 +6,7 @@ import io
 import json
 import os
 import shutil
+import struct
 import zipfile
 from dataclasses import replace
 
@@ -294,6 +295,19 @@ def test_glb_is_read_back_by_trimesh():
     assert np.array_equal(back.faces, mesh.faces)
     edges = trimesh.load(io.BytesIO(to_glb(mesh, mesh.colors, wireframe=True)), file_type="glb", process=False)
     assert len(edges.geometry) == 1
+
+
+def test_glb_colours_are_linear_light_and_opaque():
+    """128 of sRGB is 21.6 % of the light (IEC 61966-2-1), 10 is 0.3 %."""
+    colors = np.array([[255, 128, 0], [10, 10, 10], [0, 0, 0]], np.uint8)
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), colors)
+    data = to_glb(mesh, colors)
+    (length,) = struct.unpack_from("<I", data, 12)
+    view = json.loads(data[20 : 20 + length])["bufferViews"][1]
+    stored = np.frombuffer(data, np.uint16, view["byteLength"] // 2, 28 + length + view["byteOffset"]).reshape(-1, 4)
+    light = stored / 65535
+    assert np.allclose(light[:, :3], [[1, 0.21586, 0], [0.00304] * 3, [0, 0, 0]], atol=2e-5)
+    assert (stored[:, 3] == 65535).all()
 
 
 @pytest.mark.parametrize("triangles", [500, 5000, 10**6])
