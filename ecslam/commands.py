@@ -175,7 +175,7 @@ def run_headless(engine: Engine) -> None:
 
 def progress_line(s: Snapshot, window: int, wide: bool = True) -> str:
     """The state of a run in a line. window: keyframes in the last bundle adjustment. loss: objective of the last
-    mapping; residual, where the line may be ``wide``: of the frame's direct alignment."""
+    mapping; residual, where the line may be ``wide``: ``align_mm`` of the frame, see ``StepReport``."""
     figures = [f"{s.state.value} {s.frame + 1}/{s.frames_total}", f"{s.fps_wall:.1f} frames/s"]
     if s.map_loss is not None:
         figures.append(f"loss {s.map_loss:.3f}")

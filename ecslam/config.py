@@ -113,7 +113,10 @@ class TrackingConfig:
     lr_translation: float = _number(1e-3, 0.0, 1.0)
     momentum: float = _number(0.5, 0.0, 0.999)
     unaligned_rate: float = _number(4.0, 0.0, 1e3)
-    loss: LossWeights = LossWeights(10.0, 200.0, 50.0, 1.0, 0.25, 5.0, 1.25)
+    loss: LossWeights = LossWeights(
+        free_space=10.0, centre=200.0, tail=50.0,
+        depth_uniform=1.0, depth_feature=0.25, colour_uniform=5.0, colour_feature=1.25,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

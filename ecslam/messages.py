@@ -60,10 +60,12 @@ class LoopEvent:
 class StepReport:
     """What ``Slam.step`` did with one frame.
 
-    losses: weighted terms of the last optimisation (``free_space``, ``centre``, ``tail``, ``depth``, ``colour`` ...).
+    losses: weighted terms of the last optimisation (``free_space``, ``centre``, ``tail``, ``depth``, ``colour``); where
+    direct alignment alone tracks ``align_mm``: the root of its robust cost per point, luminance included, millimetres.
     window: frame indices of the keyframes in the bundle adjustment that was applied with this frame (else empty).
     map_ms: what that took, in the schedule ``overlap`` beside tracking.
-    c2w: float64 [4, 4] estimate for this frame after all corrections. tracked is False when the pose is only predicted.
+    c2w: float64 [4, 4] estimate for this frame after all corrections. tracked: False where it is that of the frame
+    before, since none was to be trusted.
     """
 
     frame: int

@@ -81,15 +81,5 @@ def view_centre(rays: RayBatch) -> Tensor:
 
 
 def kernel_weights(loss: LossWeights, config: Config) -> Weights:
-    """The kernels' view of the loss weights."""
-    return Weights(
-        loss.free_space,
-        loss.centre,
-        loss.tail,
-        loss.depth_uniform,
-        loss.depth_feature,
-        loss.colour_uniform,
-        loss.colour_feature,
-        config.truncation_m,
-        config.centre_share,
-    )
+    """The kernels' view of the loss weights, which have the same names there."""
+    return Weights(**vars(loss), truncation_m=config.truncation_m, centre_share=config.centre_share)

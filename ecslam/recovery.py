@@ -29,8 +29,8 @@ RELOCALISE_KERNELS_M, RELOCALISE_ITERATIONS = (0.2, 0.06, 0.02), 20
 
 
 class Recovery:
-    """Judges every tracked pose. ``missed``: this frame's pose is only predicted. ``lost``: several in a row were; no
-    mapping until a keyframe is recognised again."""
+    """Judges every tracked pose. ``missed``: this frame's was not trusted, so it has that of the frame before.
+    ``lost``: several in a row were missed; no mapping until a place is recognised again."""
 
     def __init__(self) -> None:
         self.lost, self.missed, self.note = False, False, ""

@@ -1,11 +1,14 @@
-"""Shared by all tests: where real recordings may lie, and one thread pool per core at most."""
+"""Shared by all tests: where real recordings may lie, and no example of a property is too slow on a busy machine."""
 
 import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 ROOT = Path(__file__).parent.parent
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
 
 
 @pytest.fixture(scope="session")

@@ -9,10 +9,13 @@ import numpy as np
 
 from ecslam.config import Config, FieldConfig
 from ecslam.messages import LoopEvent, StepReport
+from ecslam.rigid import rotations
 from ecslam.types import Frame, FrameError, InputError, Intrinsics
 
 QUICK = Config(field=FieldConfig(finest_voxel_m=0.1))
 CAMERA = Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48)
+TURN_DEG = 2.0  # a closed loop's frame before the closure
+TURNED = rotations(np.array([[0, np.sin(np.radians(TURN_DEG / 2)), 0, np.cos(np.radians(TURN_DEG / 2))]]))[0]
 
 
 def circle(count: int) -> np.ndarray:
@@ -124,6 +127,7 @@ class FakeSlam:
         loop = None
         if frame.index == b.loop_at:
             centres = self.trajectory.poses()[:, :3, 3].astype(np.float32)
+            before[:3, :3] = before[:3, :3] @ TURNED
             loop = LoopEvent(frame.index, (0,), 1.0, 0.1, 2.0, 1.0, None, None, None, None, centres, before)
         return StepReport(
             frame=frame.index,

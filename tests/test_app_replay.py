@@ -6,15 +6,17 @@ import io
 import json
 import os
 import shutil
+import struct
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from ecslam_app import server, theme
-from ecslam_app.geometry import best_side, overview, rotation_difference_deg, rotation_to, up_direction
+from ecslam_app.geometry import best_side, frustum_lines, overview, rotation_difference_deg, rotation_to, up_direction
 from ecslam_app.glb import simplify, to_glb, vertex_normals
-from ecslam_app.history import History, history_of
+from ecslam_app.history import History, discrepancy, history_of
 from ecslam_app.panels.compare import figures_table
 from ecslam_app.past import Past
 from ecslam_app.record import html_replay
@@ -260,6 +262,31 @@ def test_html_replay_is_one_file_without_addresses_of_others(replay, tmp_path):
 # ---- what is drawn ------------------------------------------------------------------------------------------------
 
 
+def test_a_frustum_is_as_wide_and_high_as_its_camera_sees():
+    c2w = np.eye(4)
+    c2w[:3, 3] = 5, 6, 7
+    lines = frustum_lines(c2w[None], 2 * np.arctan(0.5), 4 / 3, 2.0)
+    assert lines.shape == (8, 2, 3)
+    corners = np.unique(lines.reshape(-1, 3).round(4), axis=0) - c2w[:3, 3]
+    wanted = [[0, 0, 0], *([x, y, 2] for x in (-4 / 3, 4 / 3) for y in (-1, 1))]
+    assert np.allclose(sorted(corners.tolist()), sorted(wanted), atol=1e-4)
+
+
+def test_the_loop_timeline_credits_an_error_to_its_frame_however_many_there_are(replay):
+    truth = np.tile(np.eye(4), (1000, 1, 1))
+    angle = np.radians(0.01 * np.arange(1000))
+    turned = truth.copy()
+    turned[:, 0, 0] = turned[:, 2, 2] = np.cos(angle)
+    turned[:, 0, 2], turned[:, 2, 0] = np.sin(angle), -np.sin(angle)
+    truth[:, :3, :3] = truth[:, :3, :3] @ turned[::-1, :3, :3]
+    snapshot = replace(replay.latest(), trajectory=truth @ turned, trajectory_gt=truth)
+    title, frames, degrees = discrepancy(snapshot, 100)
+    assert "°" in title
+    assert len(frames) == 100
+    assert (frames[0], frames[-1]) == (0, 999)
+    assert np.allclose(degrees, 0.01 * frames, atol=1e-5)
+
+
 def test_glb_is_read_back_by_trimesh():
     mesh = room_mesh(0.3)
     scene = trimesh.load(io.BytesIO(to_glb(mesh, mesh.colors)), file_type="glb", process=False)
@@ -268,6 +295,19 @@ def test_glb_is_read_back_by_trimesh():
     assert np.array_equal(back.faces, mesh.faces)
     edges = trimesh.load(io.BytesIO(to_glb(mesh, mesh.colors, wireframe=True)), file_type="glb", process=False)
     assert len(edges.geometry) == 1
+
+
+def test_glb_colours_are_linear_light_and_opaque():
+    """128 of sRGB is 21.6 % of the light (IEC 61966-2-1), 10 is 0.3 %."""
+    colors = np.array([[255, 128, 0], [10, 10, 10], [0, 0, 0]], np.uint8)
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), colors)
+    data = to_glb(mesh, colors)
+    (length,) = struct.unpack_from("<I", data, 12)
+    view = json.loads(data[20 : 20 + length])["bufferViews"][1]
+    stored = np.frombuffer(data, np.uint16, view["byteLength"] // 2, 28 + length + view["byteOffset"]).reshape(-1, 4)
+    light = stored / 65535
+    assert np.allclose(light[:, :3], [[1, 0.21586, 0], [0.00304] * 3, [0, 0, 0]], atol=2e-5)
+    assert (stored[:, 3] == 65535).all()
 
 
 @pytest.mark.parametrize("triangles", [500, 5000, 10**6])
@@ -321,6 +361,9 @@ def test_a_wall_is_looked_at_from_its_front_and_the_choice_lasts():
     turned = best_side(Mesh(wall.vertices, wall.faces[:, ::-1]), up)
     assert turned[0] < -0.7
     assert np.array_equal(best_side(room_mesh(0.3), up, side), side)
+    for degrees, stays in ((20, True), (35, True), (60, False), (180, False)):
+        before = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0])
+        assert np.array_equal(best_side(wall, up, before), before) == stays
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, -1, 0], [0.6, 0, 0.8]])

@@ -98,7 +98,7 @@ def test_every_truncation_is_found(file: Path) -> None:
         fails(file, r"truncated|neither|damaged")
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from([n for n in FILES if n.endswith("png")]), st.data())
 def test_every_flipped_bit_of_a_png_is_found(tmp_path: Path, name: str, data: st.DataObject) -> None:
     content = bytearray(FILES[name])
@@ -109,7 +109,7 @@ def test_every_flipped_bit_of_a_png_is_found(tmp_path: Path, name: str, data: st
         read(tmp_path / name)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_damaged_jpeg_is_found_or_has_the_right_size(tmp_path: Path, data: st.DataObject) -> None:
     content = bytearray(JPEG)
@@ -124,7 +124,7 @@ def test_a_damaged_jpeg_is_found_or_has_the_right_size(tmp_path: Path, data: st.
     assert image.shape == (H, W, 3)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from([b"", b"\xff\xd8", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", PNG[:30]]), st.binary(max_size=200))
 def test_any_bytes_are_a_frame_error(tmp_path: Path, start: bytes, rest: bytes) -> None:
     (tmp_path / "color.jpg").write_bytes(start + rest)

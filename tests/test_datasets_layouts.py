@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ecslam.datasets import open_sequence, problems, registry, select_frames
+from ecslam.datasets.reading import rigid
 from ecslam.datasets.tum import associate, interpolate_poses
 from ecslam.types import FrameError, InputError, Sequence
 
@@ -392,6 +393,39 @@ def test_too_few_poses_are_refused_and_spare_ones_noted(tmp_path: Path, name: st
         open_sequence(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["replica", "vmap"])
+def test_a_frame_has_the_pose_of_its_own_number(tmp_path: Path, name: str) -> None:
+    WRITERS[name](tmp_path)
+    for gone in (0, 3):
+        for file in [*tmp_path.rglob(f"*{gone:06d}.*"), *tmp_path.rglob(f"*_{gone}.png")]:
+            file.unlink()
+    sequence = open_sequence(tmp_path)
+    poses = sequence.poses_gt()
+    assert poses is not None
+    np.testing.assert_allclose(poses, np.stack([pose(i) for i in (1, 2, 4, 5)]))
+    np.testing.assert_allclose(sequence.timestamps(), np.array([1, 2, 4, 5]) / 30)
+
+
+def test_a_pose_that_mirrors_stretches_or_is_no_number_is_left_out() -> None:
+    mirrored, stretched, endless, odd = (pose(2) for _ in range(4))
+    mirrored[:3, 0] *= -1
+    stretched[:3, :3] *= 1.02
+    endless[0, 3] = np.inf
+    odd[3, 0] = 0.1
+    found, notes = rigid(np.stack([pose(1), mirrored, stretched, endless, odd]))
+    assert np.isfinite(found).all((1, 2)).tolist() == [True, False, False, False, False]
+    assert notes[0].startswith("4 of 5")
+
+
+def test_replica_without_camera_parameters_is_the_usual_camera(tmp_path: Path) -> None:
+    write(tmp_path / "results/frame000000.jpg", np.zeros((680, 1200, 3), np.uint8))
+    write(tmp_path / "results/depth000000.png", np.full((680, 1200), 13107, np.uint16))
+    sequence = open_sequence(tmp_path)
+    k = sequence.intrinsics
+    assert (k.fx, k.fy, k.cx, k.cy, k.width, k.height) == (600, 600, 599.5, 339.5, 1200, 680)
+    np.testing.assert_allclose(sequence[0].depth, 2)
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"camera": {"w": 64}}', '{"camera": {"w": "a"}}', "[" * 100_000])
 def test_replica_with_broken_camera_parameters_is_refused(tmp_path: Path, text: str) -> None:
     (write_replica(tmp_path) / "cam_params.json").write_text(text)
@@ -505,6 +539,11 @@ def test_undistortion_moves_a_pixel_to_where_the_ideal_camera_sees_it(tmp_path: 
         np.testing.assert_allclose([xs.mean(), ys.mean()], expected, atol=0.3)
     assert np.linalg.norm(expected - point[0, 0]) > 2
     assert set(np.unique(frame.depth)) == {0.0, 1.0}
+
+
+def test_tum_frames_have_the_times_of_their_depth_images(tmp_path: Path) -> None:
+    times = open_sequence(write_tum(tmp_path)).timestamps()
+    np.testing.assert_allclose(times, 1305031102.011 + np.arange(N) / 30, rtol=0, atol=2e-6)
 
 
 def test_tum_drops_and_counts_what_has_no_partner(tmp_path: Path) -> None:

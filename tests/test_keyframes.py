@@ -6,7 +6,7 @@ import numpy as np
 
 from ecslam.config import Config
 from ecslam.datasets import open_sequence
-from ecslam.keyframes import Keyframe, Shelf, make_keyframe
+from ecslam.keyframes import Keyframe, Shelf, make_keyframe, make_thumbnail, most_similar, surface_points
 from ecslam.pixels import Pixels
 
 
@@ -44,3 +44,32 @@ def test_a_shelf_takes_what_is_larger_than_its_blocks_and_what_is_empty():
         assert len(kept.pixels) == count
         assert kept.pixels.depth.sum() == count
         assert (kept.thumbnail == 7).all()
+
+
+def picture(seed):
+    coarse = np.random.default_rng(seed).integers(60, 140, (6, 8, 3), np.uint8)
+    return np.kron(coarse, np.ones((20, 20, 1), np.uint8))
+
+
+def test_a_picture_is_most_similar_to_itself_however_bright_it_is():
+    kept = [Keyframe.of(k, flat(3), make_thumbnail(picture(k))) for k in range(6)]
+    for k in range(6):
+        brighter = make_thumbnail((1.5 * picture(k) + 20).astype(np.uint8))
+        assert abs(brighter.mean()) < 1e-6
+        assert abs(np.linalg.norm(brighter) - 1) < 1e-5
+        assert kept[k].thumbnail @ brighter > 0.99
+        found = most_similar(kept, brighter, 3)
+        assert found[0] == k
+        score = [float(kept[i].thumbnail @ brighter) for i in found]
+        assert score == sorted(score, reverse=True)
+        assert score[-1] >= sorted(float(one.thumbnail @ brighter) for one in kept)[-3]
+
+
+def test_surface_points_are_thinned_to_the_limit_and_lie_where_their_cameras_saw_them():
+    kept = [Keyframe.of(k, flat(1000), np.zeros(1200, np.float32)) for k in range(3)]
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = 10, 20, 30
+    assert len(surface_points(kept, poses, 10_000)) == 3000
+    few = surface_points(kept, poses, 300)
+    assert 250 <= len(few) <= 303
+    assert {tuple(point) for point in few.tolist()} == {(10, 0, 1), (20, 0, 1), (30, 0, 1)}

@@ -29,6 +29,13 @@ def test_pixels_are_known_where_the_wall_has_been_seen():
     assert observed.known(wall, moved, same_count=False) is wall
 
 
+def test_a_pixel_without_depth_is_not_known_where_the_camera_stands():
+    observed, wall = ObservedVoxels(), plane(1000)
+    wall.depth[:400] = 0
+    observed.add(np.concatenate([wall.points(), np.full((1, 3), 0.01, np.float32)]), np.eye(4))
+    assert len(observed.known(wall, np.eye(4), same_count=False)) == 600
+
+
 @pytest.mark.parametrize("same_count", [True, False])
 def test_their_number_stays_where_a_recorded_loop_needs_it(same_count):
     observed, wall = ObservedVoxels(), plane(1000)

@@ -51,6 +51,12 @@ def test_features_are_corners_and_come_first(frame):
     )  # the picture's corners lie on a 20-pixel lattice
 
 
+def test_features_are_half_of_the_pixels_at_most(frame):
+    pixels = choose_pixels(frame, CAMERA, 100, Config(), np.random.default_rng(0))
+    assert len(pixels) == 100
+    assert pixels.feature.sum() == 50
+
+
 def test_ablation_takes_no_features(frame):
     pixels = choose_pixels(frame, CAMERA, 1000, Config(fus=False), np.random.default_rng(0))
     assert len(pixels) == 1000
@@ -60,7 +66,12 @@ def test_ablation_takes_no_features(frame):
 def test_directions_and_points_project_back(frame):
     pixels = choose_pixels(frame, CAMERA, 500, Config(), np.random.default_rng(1))
     u = pixels.direction[:, 0] * CAMERA.fx + CAMERA.cx
+    v = pixels.direction[:, 1] * CAMERA.fy + CAMERA.cy
     assert np.allclose(u, np.rint(u), atol=1e-3)
+    assert np.allclose(v, np.rint(v), atol=1e-3)
+    index = np.rint(v).astype(int), np.rint(u).astype(int)
+    assert (pixels.color == frame.color[index]).all()
+    assert (pixels.depth == frame.depth[index]).all()
     assert (pixels.depth[np.rint(u) < 100] == 0).all()
     assert np.allclose(pixels.points()[:, 2], 2.0)
     assert len(pixels.points()) == (pixels.depth > 0).sum()

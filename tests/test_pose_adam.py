@@ -1,6 +1,7 @@
 """Adam for poses: it turns a camera about what it sees."""
 
 import numpy as np
+import pytest
 import torch
 
 from ecslam import se3
@@ -58,3 +59,19 @@ def test_poses_that_turn_about_what_they_see_come_to_rest_at_the_truth():
     assert np.mean(about_middle) < 0.07
     assert np.mean(about_camera) > 0.12
     assert np.mean(sluggish) > 0.3
+
+
+def test_rates_are_of_translation_first_and_none_for_a_fixed_pose():
+    rates = pose_rates(torch.tensor([False, True]), lr_rotation=0.1, lr_translation=0.2)
+    assert rates.tolist() == [[0.2, 0.2, 0.2, 0.1, 0.1, 0.1], [0.0] * 6]
+
+
+@pytest.mark.parametrize(("share", "part"), [(None, 1.0), (0.25, 0.25), (torch.tensor(0.5), 0.5), (0.0, 0.0)])
+def test_the_first_step_is_as_long_as_the_share_of_the_rate(share, part):
+    """Adam's first step goes against the gradient's sign, however large that is."""
+    adam = PoseAdam(torch.eye(4, dtype=torch.float64)[None], pose_rates(torch.tensor([False]), 0.01, 0.02))
+    gradient = torch.zeros(1, 3, 4)
+    gradient[0, 0, 3], gradient[0, 1, 3] = 7.0, -1e-3
+    adam.step(gradient, share)
+    expected = part * torch.tensor([-0.02, 0.02, 0], dtype=torch.float64)
+    assert torch.allclose(adam.c2w[0, :3, 3], expected, atol=1e-6)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ecslam.rigid import quaternions, rotations
+from ecslam.rigid import orthonormalise, quaternions, rotations
 
 HALF_TURNS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -2, 3], [-1, 2, 2]])
 
@@ -34,3 +34,10 @@ def test_the_length_of_a_quaternion_does_not_matter():
 
 def test_none_is_none():
     assert rotations(quaternions(np.empty((0, 3, 3)))).shape == (0, 3, 3)
+
+
+def test_the_nearest_rigid_motion_never_mirrors():
+    turn = Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix()
+    bent = np.tile(np.eye(4), (2, 1, 1))
+    bent[:, :3, :3] = turn @ np.diag([1, 1, -0.1]), turn @ np.diag([1.1, 0.9, 0.2])
+    assert np.allclose(orthonormalise(bent)[:, :3, :3], turn)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from fake_slam import QUICK, Behaviour, FakeSequence
+from fake_slam import QUICK, TURN_DEG, Behaviour, FakeSequence
 from runtime_watch import Watch, running
 
 from ecslam import config_files
@@ -311,6 +311,7 @@ def test_pause_on_loop_and_the_loop_event_carries_errors_against_ground_truth(tm
         loop = watch.event(LoopEvent)
         assert snapshot.loops == (loop,)
         assert loop.error_before_cm == pytest.approx(2 * loop.error_after_cm)
+        assert loop.rotation_error_before_deg == pytest.approx(TURN_DEG)
         assert loop.rotation_error_after_deg == pytest.approx(0, abs=1e-5)
     logged = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
     assert [e["frame"] for e in logged if e["type"] == "loop"] == [7]

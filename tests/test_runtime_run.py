@@ -204,16 +204,18 @@ def test_snapshots_keep_a_row_for_each_frame_and_say_lost(tmp_path, monkeypatch)
     assert states[8] is State.TRACKING
     assert states[10] is State.MAPPING
     assert last.state is State.FINISHED
+    assert last.fov_y_rad == pytest.approx(2 * np.arctan(24 / 60))  # of 48 rows at 60 pixels
+    assert last.aspect == pytest.approx(64 / 48)
     assert [k.frame for k in last.keyframes] == [0, 5, 10]
     assert np.array_equal(last.keyframes[1].c2w, last.trajectory[5])
 
 
 def test_progress_sees_the_run(tmp_path):
     seen = []
-    engine(tmp_path).run(seen.append)
+    summary = engine(tmp_path).run(seen.append)
     assert seen[0].state is State.INITIALISING
     assert seen[-1].state is State.FINISHED
-    assert seen[-1].ate_cm is not None
+    assert seen[-1].ate_cm == summary["ate_rmse_cm"] > summary["ate_mean_cm"]
 
 
 def test_the_progress_line_names_the_loss_of_mapping_and_the_residual_of_tracking_apart(tmp_path):

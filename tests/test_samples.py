@@ -1,11 +1,14 @@
 """Depths along rays."""
 
+from types import SimpleNamespace
+
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecslam.config import SamplingConfig
-from ecslam.samples import importance_depths, ray_exit, sample_depths, stratified
+from ecslam.kernels import RayBatch
+from ecslam.samples import importance_depths, ray_exit, rendered_depths, sample_depths, stratified
 
 
 def jitter(*shape, seed=0):
@@ -26,6 +29,11 @@ def test_samples_are_sorted_and_where_they_belong(depths, seed):
     assert (near >= config.near_depth).all()
 
 
+def test_samples_near_the_depth_fill_the_whole_range_around_it():
+    z = sample_depths(torch.full((50,), 2.0), torch.full((50,), 8.0), SamplingConfig(uniform=0), jitter(50, 11))
+    assert (((z - 1.9) / 0.2 * 11).floor() == torch.arange(11)).all()
+
+
 def test_rays_without_depth_reach_the_end_of_the_box():
     z = sample_depths(torch.zeros(50), torch.full((50,), 3.0), SamplingConfig(), jitter(50, 43))
     assert z.max() <= 3
@@ -43,6 +51,29 @@ def test_importance_samples_gather_at_the_weights():
     found = importance_depths(z, weights, jitter(100, 11))
     assert found.shape == (100, 11)
     assert ((found - 2.5).abs() < 0.4).float().mean() > 0.95
+    assert abs(float(found.mean()) - 2.5) < 0.02
+
+
+class Wall:
+    """A back end whose map is a wall at 2.5 m. looked: the depths it was asked to render."""
+
+    def render(self, layout, params, c2w, rays):
+        self.looked = rays.z
+        return rays.color, rays.depth, torch.exp(-(((rays.z - 2.5) / 0.2) ** 2))
+
+
+def test_rendered_depths_look_for_the_surface_along_the_whole_ray():
+    zero, config, wall = torch.zeros(5), SamplingConfig(uniform=16, near_depth=5), Wall()
+    z = sample_depths(zero, torch.full((5,), 4.0), config, torch.full((5, 21), 0.5))
+    rays = RayBatch(torch.ones(5, 3), z, zero, torch.zeros(5, 3), zero > 0, zero.long())
+    field = SimpleNamespace(layout=None, params=None)
+    found = rendered_depths(rays, torch.eye(4)[None], field, wall, config, jitter(5, 5))
+    assert wall.looked.shape == (5, 16)
+    assert wall.looked.max() > 3.6
+    assert wall.looked.diff(dim=1).max() < 0.6
+    assert found.shape == z.shape
+    assert (found.diff(dim=1) >= 0).all()
+    assert ((found - 2.5).abs() < 0.5).sum(1).ge(5 + 3).all(), "the new ones and those that were there"
 
 
 def test_ray_exit_of_a_box():

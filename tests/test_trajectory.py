@@ -43,6 +43,18 @@ def test_prediction_is_constant_velocity():
     assert np.allclose(build().predict(), moved(1.2))
 
 
+def test_prediction_goes_on_along_a_curve():
+    """A motion is one in the camera's own axes: the same step and the same turn once more."""
+    step = se3.retract(
+        torch.eye(4, dtype=torch.float64), torch.tensor([0.1, 0, 0.2, 0, 0.3, 0], dtype=torch.float64)
+    ).numpy()
+    t, pose = Trajectory(), moved(5)
+    for i in range(3):
+        t.append(pose, i / 30, i == 0)
+        pose = pose @ step
+    assert np.allclose(t.predict(), pose)
+
+
 def test_state_round_trip():
     t = build()
     state = t.state()

@@ -33,7 +33,7 @@ def trajectories(seed: int, n: int = 60) -> tuple[np.ndarray, np.ndarray]:
     return random_motion(rng).apply_to_poses(estimate), truth
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(SEEDS)
 def test_a_rigid_motion_of_either_side_changes_nothing(seed: int) -> None:
     estimate, truth = trajectories(seed)
@@ -53,7 +53,7 @@ def test_a_rigid_motion_of_either_side_changes_nothing(seed: int) -> None:
     assert relative_moved.deg.rmse == pytest.approx(relative.deg.rmse, rel=1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(SEEDS, st.floats(0.1, 10))
 def test_alignment_finds_the_motion_back(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
@@ -65,7 +65,7 @@ def test_alignment_finds_the_motion_back(seed: int, scale: float) -> None:
     assert found.scale == pytest.approx(scale)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(SEEDS)
 def test_no_other_motion_is_better(seed: int) -> None:
     estimate, truth = trajectories(seed)
@@ -160,7 +160,7 @@ def test_evo_agrees(with_scale: bool, delta: int) -> None:
         assert getattr(ours.cm, name) == pytest.approx(100 * theirs[name], abs=1e-6)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(SEEDS)
 def test_tum_files_give_back_what_was_written(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     path = tmp_path_factory.mktemp("tum") / "trajectory.txt"

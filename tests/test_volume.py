@@ -54,6 +54,18 @@ def test_what_nobody_saw_is_unknown():
     assert FusedVolume(0.02, 0.06).distances(np.empty((0, 3)))[0].shape == (0,)
 
 
+@pytest.mark.parametrize("color", [(220, 60, 10), (10, 60, 220), (255, 255, 255)])
+def test_its_luminance_is_that_of_the_points_that_are_aligned_to_it(color):
+    frame = replace(look(np.eye(4), corner()), color=np.full((CAMERA.height, CAMERA.width, 3), color, np.uint8))
+    found = FusedVolume(0.02, 0.06)
+    found.integrate(frame, CAMERA, np.eye(4), 0.1, 8.0)
+    points = known_points(found, spread_pixels(frame, CAMERA, 500, CONFIG, np.random.default_rng(0)), np.eye(4))
+    settings = replace(stages(CONFIG)[-1], colour_weight=1.0, colour_kernel=10.0)
+    colourless = found.normal_equations(np.eye(4), points, replace(settings, colour_weight=0.0))
+    added = found.normal_equations(np.eye(4), points, settings).cost - colourless.cost
+    assert np.sqrt(2 * added / colourless.used) < 1 / 255
+
+
 def test_depth_out_of_range_adds_nothing():
     out = FusedVolume(0.02, 0.06)
     out.integrate(look(np.eye(4), [(np.array([0, 0, 1.0]), 2.0)]), CAMERA, np.eye(4), 0.1, 1.9)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ecslam.config import WindowConfig
 from ecslam.datasets.synthetic import ROOMS, open_synthetic
-from ecslam.loops import LoopDetector, RevisitRule, revisited
+from ecslam.loops import LoopDetector, RevisitRule, loop_event, revisited
 from ecslam.window import parallax, random_window, select_window
 
 
@@ -72,6 +72,13 @@ def test_random_window_holds_the_current_keyframe(count, seed):
     assert len(set(window.tolist())) == len(window) <= 30
 
 
+def test_random_windows_have_every_size_up_to_the_cap():
+    rng = np.random.default_rng(0)
+    windows = [random_window(60, 2000, WindowConfig(size=6), rng) for _ in range(300)]
+    assert {len(window) for window in windows} == {2, 3, 4, 5, 6}
+    assert len(np.unique(np.concatenate(windows))) == 60
+
+
 def test_revisit_needs_to_have_been_away():
     rule = RevisitRule(away=20)
     poses = circle(100)
@@ -89,6 +96,13 @@ def test_one_event_for_one_return():
     events = [k for k in range(1, len(poses)) if len(detector.update(poses[:k], poses[k - 1]))]
     assert len(events) >= 1
     assert 80 < events[0] < 110
+
+
+def test_an_event_says_how_far_the_pose_moved_and_turned():
+    event = loop_event(40, (0, 5), look(1, 2, 10), look(1.03, 2.04, 17), 3.0, 2.0, np.zeros((41, 3), np.float32))
+    assert event.correction_cm == pytest.approx(5)
+    assert event.correction_deg == pytest.approx(7)
+    assert (event.frame, event.keyframes, event.loss_before, event.loss_after) == (40, (0, 5), 3, 2)
 
 
 @pytest.mark.parametrize("room", ROOMS)

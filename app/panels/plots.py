@@ -1,4 +1,4 @@
-"""Error, losses and times over the frames."""
+"""Error, losses, residual and times over the frames."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Panel(BasePanel):
         super().__init__(hub)
         self._error = Chart(hub, "Error so far (ATE, cm)")
         self._losses = Chart(hub, "Weighted losses")
-        self._residual = Chart(hub, "Distance to the surface (mm)")
+        self._residual = Chart(hub, "Alignment residual (mm)")
         self._times = Chart(hub, "Time per frame (ms)", peaks=False)
         self._shown = 0.0
 

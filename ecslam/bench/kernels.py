@@ -20,6 +20,7 @@ from ..field import TsdfField, create_field, map_params
 from ..kernels import AlignSettings, Backend, RayBatch, Weights
 from ..kernels.graphs import Recorder
 from ..kernels.types import FEATURES, HIDDEN
+from ..rays import kernel_weights
 from ..samples import sample_depths
 from ..types import InputError
 
@@ -182,11 +183,7 @@ def _reading(field: TsdfField, poses: torch.Tensor, batch: RayBatch, points: tor
 
 
 def _weights() -> Weights:
-    loss, config = Config().mapping.loss, Config()
-    return Weights(
-        loss.free_space, loss.centre, loss.tail, loss.depth_uniform, loss.depth_feature, loss.colour_uniform,
-        loss.colour_feature, config.truncation_m, config.centre_share,
-    )  # fmt: skip
+    return kernel_weights(Config().mapping.loss, Config())
 
 
 def _batch(

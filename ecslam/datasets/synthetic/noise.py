@@ -15,7 +15,7 @@ from ...types import Intrinsics
 BASELINE_FOCAL = 0.075 * 580.0  # metres times pixels, Kinect v1
 DISPARITY_STEP = 1 / 8
 DISPARITY_SIGMA = 0.06
-LATERAL_SIGMA = 0.8 * 480 / 640 / 480  # of the image width
+LATERAL_SIGMA = 0.8 / 640  # of the image width
 NEAR_M, FAR_M = 0.35, 8.0
 GRAZING_COSINE = 0.14
 EDGE_JUMP = 0.04
