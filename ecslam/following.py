@@ -69,7 +69,7 @@ class Follower:
         self, frame: Frame, trajectory: Trajectory, keyframes: list[Keyframe], field: TsdfField, config: Config
     ) -> TrackResult:
         """The pose of the frame after ``trajectory``: a constant-velocity start, the preset's tracker on ``field``, and
-        recovery when the map does not explain the frame. ``recovery`` then says whether the pose is only predicted."""
+        recovery when the map does not explain the frame, which then says whether it is only the last pose again."""
         if config.tracking.iterations > 0 or self._volume is None:
             self._observe(trajectory, keyframes)
         surface, tracker = self._tracker(field, config)

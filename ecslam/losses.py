@@ -21,13 +21,13 @@ def smooth_lattice(field: TsdfField, config: MappingConfig, generator: torch.Gen
     return torch.minimum(torch.maximum(lattice, low), high).to(field.device)
 
 
-def smoothness(field: TsdfField, lattice: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean squared difference of hash features between lattice neighbours (Co-SLAM, equation 9), and its gradient
-    with respect to the table. Written level by level without autograd, whose graph would take gigabytes."""
+def smoothness_gradient(field: TsdfField, lattice: Tensor) -> Tensor:
+    """Gradient [rows, 2] by the table of the mean squared difference of hash features between lattice neighbours
+    (Co-SLAM, equation 9). Written level by level without autograd, whose graph would take gigabytes."""
     layout, table = field.layout, field.params.table
     n = round(len(lattice) ** (1 / 3))
     corners = torch.tensor(CORNERS, device=table.device)
-    gradient, total = torch.zeros_like(table), table.new_zeros(())
+    gradient = torch.zeros_like(table)
     for level in range(layout.levels):
         p = (lattice - layout.anchor.to(lattice)) / layout.voxel[level].to(lattice)
         cell = p.floor()
@@ -38,9 +38,8 @@ def smoothness(field: TsdfField, lattice: Tensor) -> tuple[Tensor, Tensor]:
         d_feature = torch.zeros_like(feature)
         for axis in range(3):
             d = torch.diff(feature, dim=axis)
-            total += d.square().sum() / n**3
             d_feature.narrow(axis, 1, n - 1).add_(d, alpha=2 / n**3)
             d_feature.narrow(axis, 0, n - 1).sub_(d, alpha=2 / n**3)
         spread = weight[..., None] * d_feature.reshape(-1, 1, feature.shape[-1])
         gradient.index_add_(0, rows.reshape(-1), spread.reshape(-1, feature.shape[-1]))
-    return total, gradient
+    return gradient
