@@ -117,16 +117,16 @@ def device_draw(
 ) -> DeviceDraw:
     """What to draw from these views. Sizes are always the same, so that a graph can be replayed: exactly ``rays`` rays,
     and room for so many ``poses``."""
-    m = config.mapping
+    m, places = config.mapping, bank.places(views)
     spans = np.zeros((poses, 2), np.int64)
-    spans[: len(views)] = bank.spans(views)
+    spans[: len(views)] = [(place.first, len(place.view)) for place in places]
     row = np.repeat(np.arange(len(views)), shares(len(views), m.rays, m.newest_share))
     return DeviceDraw(
         bank.columns,
         torch.from_numpy(spans).to(device),
         torch.from_numpy(row[evenly(len(row), m.rays)]).to(device),
         box.to(device),
-        any(bool((view.depth <= 0).any()) for view in views),
+        any(place.missing for place in places),
     )
 
 

@@ -41,13 +41,12 @@ class Keyframe:
     @property
     def pixels(self) -> Pixels:
         """The stored pixels, views of ``record``."""
-        n = len(self)
-        direction, depth, color, feature = np.split(self.record[THUMBNAIL_BYTES:], [8 * n, 12 * n, 15 * n])
+        n, stored = len(self), self.record[THUMBNAIL_BYTES:]
         return Pixels(
-            direction.view(np.float32).reshape(n, 2),
-            depth.view(np.float32),
-            color.reshape(n, 3),
-            feature.view(np.bool_),
+            stored[: 8 * n].view(np.float32).reshape(n, 2),
+            stored[8 * n : 12 * n].view(np.float32),
+            stored[12 * n : 15 * n].reshape(n, 3),
+            stored[15 * n :].view(np.bool_),
         )
 
     @property

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from .pixels import Pixels
 from .rays import DevicePixels, upload
 
 LEAST_ROOM = 1 << 22  # more room is another place, over which loops are recorded anew
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the pixels of a view lie: from the row ``first`` on. missing: whether some of them have no depth."""
+
+    view: Pixels
+    first: int
+    missing: bool
 
 
 class PixelBank:
@@ -23,23 +30,23 @@ class PixelBank:
 
     def __init__(self, device: torch.device) -> None:
         self._device, self._used = device, 0
-        self._held: dict[int, tuple[Pixels, int]] = {}
+        self._places: dict[int, Place] = {}
         self.columns = self._allocate(0)
 
-    def spans(self, views: Sequence[Pixels]) -> NDArray[np.int64]:
-        """[W, 2] first row and count of each view in ``columns``; what is not there yet is uploaded."""
-        return np.array([[self._first_row(view), len(view)] for view in views], np.int64).reshape(-1, 2)
+    def places(self, views: Sequence[Pixels]) -> list[Place]:
+        """Where each view lies in ``columns``; what is not there yet is uploaded."""
+        return [self._place(view) for view in views]
 
-    def _first_row(self, view: Pixels) -> int:
-        place = view.depth.ctypes.data  # of memory that is held here, so nothing else comes to lie there
-        if place not in self._held:
+    def _place(self, view: Pixels) -> Place:
+        key = view.depth.ctypes.data  # of memory that is held here, so nothing else comes to lie there
+        if key not in self._places:
             first, last = self._used, self._used + len(view)
             self._require(last)
             new = upload(view, self._device)
             for f in fields(DevicePixels):
                 getattr(self.columns, f.name)[first:last] = getattr(new, f.name)
-            self._held[place], self._used = (view, first), last
-        return self._held[place][1]
+            self._places[key], self._used = Place(view, first, bool((view.depth <= 0).any())), last
+        return self._places[key]
 
     def _require(self, rows: int) -> None:
         if rows > len(self.columns.depth):

@@ -238,12 +238,13 @@ def test_a_bank_holds_every_view_once_and_grows(monkeypatch):
     monkeypatch.setattr("ecslam.pixel_bank.LEAST_ROOM", 8)
     bank, views = PixelBank(CPU), [flat(count, count) for count in (5, 3, 20)]
     first = bank.columns
-    assert bank.spans(views[:2]).tolist() == [[0, 5], [5, 3]]
+    assert [place.first for place in bank.places(views[:2])] == [0, 5]
     assert bank.columns is first
-    assert bank.spans([views[2], views[0]]).tolist() == [[8, 20], [0, 5]]
+    assert [place.first for place in bank.places([views[2], views[0]])] == [8, 0]
     assert bank.columns is not first
-    for (start, count), view in zip(bank.spans(views).tolist(), views, strict=True):
-        held = bank.columns.take(torch.arange(start, start + count))
+    assert [place.missing for place in bank.places([*views, flat(4, 0)])] == [False, False, False, True]
+    for place, view in zip(bank.places(views), views, strict=True):
+        held = bank.columns.take(torch.arange(place.first, place.first + len(view)))
         expected = upload(view, CPU)
         assert torch.equal(held.direction, expected.direction)
         assert torch.equal(held.color, expected.color)
