@@ -24,15 +24,19 @@ _POLICY = (
     "connect-src 'self' ws://{host} wss://{host} blob: data:; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'none'"
 )
-# A button that was clicked keeps the focus, and the hot key space would press it again: let go of it.
-_LET_GO = "addEventListener('click',e=>{if(e.detail&&e.target.closest('button'))document.activeElement.blur()})"
+# A button that was clicked keeps the focus, and the hot key space would press it again: let go of it. One that the
+# keyboard has reached is pressed with space, which is no hot key then.
+_FOCUS = (
+    "addEventListener('click',e=>{if(e.detail&&e.target.closest('button'))document.activeElement.blur()});"
+    "addEventListener('keydown',e=>{if(e.key===' '&&e.target.closest('button'))e.stopPropagation()},true)"
+)
 
 
 @lru_cache(1)
 def _page() -> tuple[bytes, bytes]:
     text = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text("utf-8")
     head = (
-        f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style><script>{_LET_GO}</script></head>'
+        f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style><script>{_FOCUS}</script></head>'
     )
     body = text.replace("<title>Viser</title>", "").replace("</head>", head, 1).encode()
     return body, gzip.compress(body)

@@ -155,8 +155,14 @@ def test_pause_step_resume_and_hot_keys(live):
     visit.page.keyboard.press("n")
     visit.wait(lambda: visit.frame == before + 2)
     visit.state("Paused")
+    visit.page.get_by_role("button", name="Step", exact=True).focus()
     visit.page.keyboard.press("Space")
-    visit.wait(lambda: visit.frame > before + 4)
+    visit.wait(lambda: visit.frame == before + 3)
+    visit.page.wait_for_timeout(1000)
+    assert visit.frame == before + 3, "space presses the button that has the focus and no more"
+    visit.page.mouse.click(300, 300)
+    visit.page.keyboard.press("Space")
+    visit.wait(lambda: visit.frame > before + 5)
     visit.press("Pause")
     visit.state("Paused")
 
