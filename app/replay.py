@@ -159,6 +159,7 @@ class ReplayEngine:
             replace(k, c2w=trajectory[at]) for k, at in zip(run.keyframes, self._past.keyframes, strict=True) if at <= i
         )
         mapped = next((r for r in run.rows[i::-1] if r.get("window")), row)
+        at_the_end = run.summary.get("ate_rmse_cm") if frame == run.last else None
         return Snapshot(
             state=state,
             sequence=self.sequences[0],
@@ -177,7 +178,7 @@ class ReplayEngine:
             map_ms=float(mapped.get("map_ms") or 0),
             fps_wall=float(run.summary.get("fps_wall") or 0),
             fps_engine=float(run.summary.get("fps_engine") or 0),
-            ate_cm=row.get("ate_cm"),
+            ate_cm=row.get("ate_cm") if at_the_end is None else at_the_end,
             memory_mb=float(run.summary.get("peak_memory_mb") or 0),
             loops=tuple(e for e in run.loops if e.frame <= frame),
             skipped=int(run.summary.get("skipped_frames") or 0),

@@ -82,6 +82,12 @@ def test_scrubbing_shows_what_was_there_at_that_frame(replay, frame):
     assert set(s.window) <= {k.frame for k in s.keyframes}
 
 
+def test_the_error_at_the_end_is_the_one_of_the_summary(replay):
+    assert replay.latest().ate_cm == replay.run.summary["ate_rmse_cm"]
+    events(replay, m.Snapshot, m.RunTo(FRAMES - 2))
+    assert replay.latest().ate_cm == replay.run.rows[FRAMES - 2]["ate_cm"]
+
+
 def test_a_run_with_skipped_frames_is_shown_by_frame_number(folder, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(folder, run)
