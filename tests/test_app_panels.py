@@ -215,6 +215,20 @@ def test_the_plots_of_a_replay_mark_the_frame_that_is_shown(replay_page):
     assert len(chart._plot.series) == 3
 
 
+def test_a_loop_is_inspected_only_while_it_has_happened(replay_page):
+    choice, scene = control(replay_page, "Loop event")[1], replay_page.hub.scene
+    with dial(replay_page) as client:
+        enter(client)
+        for frame, inspected in ((29, True), (20, False), (29, False)):
+            replay_page.engine.submit(m.RunTo(frame))
+            assert until(lambda frame=frame: replay_page.hub.current.frame == frame)
+            if inspected:
+                press(replay_page, client, "Go to", "Next event")
+                assert until(lambda: scene._inspected is not None)
+            assert until(lambda inspected=inspected: (scene._inspected is not None) == inspected)
+            assert choice.value.startswith("Frame 27") == inspected
+
+
 def test_the_space_key_plays_and_pauses_a_replay(replay_page):
     replay_page.engine.submit(m.SpeedLimit(1.0))
     replay_page.engine.submit(m.RunTo(3))

@@ -27,6 +27,7 @@ class Panel(BasePanel):
         super().__init__(hub)
         gui = hub.server.gui
         self._events: tuple[LoopEvent, ...] = ()
+        self._inspected: LoopEvent | None = None
         self._chart = Chart(hub, "Rotation error (°)", markers=True)
         self._choice = gui.add_dropdown("Loop event", (NONE,), initial_value=NONE)
         hub.on(self._choice, lambda event: self._inspect(event.client))
@@ -40,9 +41,11 @@ class Panel(BasePanel):
             hub.on(pause, lambda event: hub.submit(PauseOnLoop(bool(pause.value)), event.client))
 
     def snapshot(self, s: Snapshot) -> None:
-        if len(s.loops) != len(self._events):
-            self._events = s.loops
-            self._choice.options = (NONE, *(_name(e) for e in s.loops))
+        names = (NONE, *map(_name, s.loops))
+        if names != self._choice.options:
+            self._events, self._choice.options = s.loops, names
+            if self._inspected is not None and _name(self._inspected) not in names:
+                self._inspect(None)
         title, frames, values = discrepancy(s)
         marks = np.full(len(frames), np.nan)
         for event in s.loops:
@@ -59,7 +62,7 @@ class Panel(BasePanel):
 
     def _inspect(self, client: Any) -> None:
         event = next((e for e in self._events if _name(e) == self._choice.value), None)
-        s = self.hub.current
+        self._inspected, s = event, self.hub.current
         self.hub.scene.inspect(event, self.hub.history.window_at(event.frame) if event else ())
         self._html.content = _intro() if event is None else _figures(event)
         if s is None:
