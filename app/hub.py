@@ -297,7 +297,7 @@ class Hub:
 
     async def _connected(self, client: viser.ClientHandle) -> None:
         aspect = client.camera.aspect
-        self.post(partial(self.views.welcome, client))
+        self.post(partial(self._welcome, client))
 
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
@@ -305,6 +305,11 @@ class Hub:
             if abs(camera.aspect - aspect) > RESHAPED * aspect:
                 aspect = camera.aspect
                 self.post(partial(self.views.reshaped, client))
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        self.views.welcome(client)
+        for panel in self.panels:
+            panel.viewer()
 
     def _keyframe_clicked(self, client: viser.ClientHandle, index: int) -> None:
         self.post(partial(self._visit, client, index))

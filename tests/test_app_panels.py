@@ -302,6 +302,14 @@ def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, pag
         assert 60 < panel._pause_s < 80, "what somebody asked for says nothing about the time it takes"
 
 
+def test_a_page_opened_while_the_run_stands_still_shows_pictures(engine, page):
+    engine.skip_to(10).start()
+    assert until(lambda: page.hub.current is engine.latest())
+    with dial(page) as client:
+        enter(client)
+        assert until(lambda: m.RequestPictures() in engine.log)
+
+
 def test_a_replay_shows_the_pictures_that_its_run_kept(replay_page, engine):
     panel = next(p for p in replay_page.hub.panels if p.tab == "Pictures")
     assert "kept no pictures" in panel._html.content
