@@ -274,6 +274,24 @@ def test_page_survives_a_lost_connection(live):
     visit.errors.clear()  # the browser itself reports the lost socket
 
 
+def test_page_comes_back_when_the_server_does(tmp_path, browser):
+    engine = FakeEngine(tmp_path / "run", frames=400, period=0.25).skip_to(20).start()
+    dashboard = server.start(engine, port=0)
+    visit = Visit(browser, dashboard, 600, 400)
+    dashboard.close()
+    for _ in range(60):  # as many failures as a minute brings: from now on the browser holds each try back for seconds
+        visit.page.evaluate("void new WebSocket(location.origin.replace('http', 'ws'))")
+    visit.page.wait_for_timeout(8000)
+    engine.skip_to(30)
+    dashboard = server.start(engine, port=dashboard.port)
+    try:
+        visit.wait(lambda: visit.frame == 30, 20)
+    finally:
+        visit.page.close()
+        dashboard.close()
+        engine.stop()
+
+
 def test_usable_on_a_phone(tmp_path, browser):
     engine = FakeEngine(tmp_path / "run", frames=2000, period=0.25).start()
     dashboard = server.start(engine, port=0, dark=True)
