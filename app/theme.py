@@ -73,7 +73,7 @@ STYLE = """
 .ec-cell b{display:block;font-size:15px;line-height:1.3;white-space:nowrap;letter-spacing:-.01em}
 .ec-cell span{font-size:10.5px;color:var(--mantine-color-dimmed);white-space:nowrap}
 .ec-cell small{font-size:10.5px;font-weight:500;color:var(--mantine-color-dimmed);margin-left:2px}
-.ec-note{margin:7px 0;padding:6px 9px;border-radius:8px;border-left:3px solid var(--c);
+.ec-note{margin:7px 0;padding:6px 9px;border-radius:8px;border-left:3px solid var(--c);overflow-wrap:anywhere;
   background:color-mix(in srgb,var(--c) 10%,transparent)}
 .ec table{width:100%;border-collapse:collapse}
 .ec td,.ec th{padding:3px 4px;text-align:right;font-weight:400;

@@ -13,6 +13,7 @@ import pytest
 import viser
 from ecslam_app import server
 from ecslam_app.panel import TABS, BasePanel, find_panels
+from ecslam_app.panels.notices import Panel as Notices
 from ecslam_app.panels.status import WORDS, render
 from ecslam_app.panels.status import Panel as Status
 
@@ -227,6 +228,32 @@ def test_a_loop_is_inspected_only_while_it_has_happened(replay_page):
                 assert until(lambda: scene._inspected is not None)
             assert until(lambda inspected=inspected: (scene._inspected is not None) == inspected)
             assert choice.value.startswith("Frame 27") == inspected
+
+
+def test_notices_stay_on_the_page_until_a_restart(engine, page):
+    html = next(p for p in page.hub.panels if isinstance(p, Notices))._html
+    assert not html.visible
+    for frame in range(12):
+        engine._feed.publish(m.Notice("warning", "skipped: <cut> short", frame))
+    engine._feed.publish(m.Notice("error", "metrics.jsonl could not be saved (No space left on device)"))
+    assert until(lambda: "No space left on device" in html.content)
+    assert html.visible
+    assert html.content.index("No space") < html.content.index("Frame 11: skipped: &lt;cut&gt; short")
+    assert "Frame 4:" not in html.content
+    assert "and 5 before these, in events.jsonl" in html.content
+    engine.start().submit(m.Restart())
+    assert until(lambda: not html.visible)
+
+
+def test_a_finished_run_shows_its_notices(tmp_path):
+    run = write_run(tmp_path / "a", 30)
+    with (run / "events.jsonl").open("a") as log:
+        log.write('{"type":"notice","level":"warning","text":"lost","frame":7}\n')
+    page = server.view([run], port=0)
+    try:
+        assert "Frame 7: lost" in next(p for p in page.hub.panels if isinstance(p, Notices))._html.content
+    finally:
+        page.close()
 
 
 def test_the_space_key_plays_and_pauses_a_replay(replay_page):
