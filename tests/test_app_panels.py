@@ -13,6 +13,7 @@ import pytest
 import viser
 from ecslam_app import server
 from ecslam_app.panel import TABS, BasePanel, find_panels
+from ecslam_app.panels.loops import Panel as Loops
 from ecslam_app.panels.notices import Panel as Notices
 from ecslam_app.panels.status import WORDS, render
 from ecslam_app.panels.status import Panel as Status
@@ -228,6 +229,32 @@ def test_a_loop_is_inspected_only_while_it_has_happened(replay_page):
                 assert until(lambda: scene._inspected is not None)
             assert until(lambda inspected=inspected: (scene._inspected is not None) == inspected)
             assert choice.value.startswith("Frame 27") == inspected
+
+
+def test_without_ground_truth_nothing_on_the_page_speaks_of_it(tmp_path):
+    engine = FakeEngine(tmp_path / "run", frames=60, truth=False).skip_to(50)
+    page = server.start(engine, port=0)
+    loops, status = (next(p for p in page.hub.panels if isinstance(p, kind)) for kind in (Loops, Status))
+    try:
+        assert until(lambda: page.hub.current is engine.latest())
+        assert not loops._chart.visible, "no loop, nothing to plot"
+        engine.skip_to(59)
+        assert until(lambda: page.hub.current is engine.latest())
+        assert until(lambda: loops._chart.visible)
+        assert loops._chart._plot.title == "Correction (cm)"
+        frames, values, marks = loops._chart._plot.data
+        assert frames[np.isfinite(values)].tolist() == frames[np.isfinite(marks)].tolist() == [54]
+        assert "ground truth" not in status._html.content
+    finally:
+        page.close()
+
+
+def test_the_plots_say_that_there_is_nothing_yet(engine, page):
+    plots = next(p for p in page.hub.panels if p.tab == "Plots")
+    for frame, empty in ((0, True), (5, False)):
+        engine.skip_to(frame)
+        assert until(lambda: page.hub.current is engine.latest())
+        assert until(lambda empty=empty: plots._none.visible == empty)
 
 
 def test_notices_stay_on_the_page_until_a_restart(engine, page):

@@ -51,6 +51,7 @@ class Panel(BasePanel):
         for event in s.loops:
             at = int(np.argmin(np.abs(frames - event.frame)))
             marks[at] = np.nan_to_num(values[at])
+        self._chart.entitle(title)
         self._chart.show([title, "loop closed"], (frames, values, marks), s.frame)
 
     def _move(self, step: int, client: Any) -> None:
@@ -86,11 +87,15 @@ def _intro() -> str:
 
 def _figures(e: LoopEvent) -> str:
     rows = [
-        ("Weighted loss", theme.number(e.loss_before, 3), theme.number(e.loss_after, 3)),
-        ("Position error, cm", theme.number(e.error_before_cm), theme.number(e.error_after_cm)),
-        ("Rotation error, °", theme.number(e.rotation_error_before_deg), theme.number(e.rotation_error_after_deg)),
+        ("Weighted loss", e.loss_before, e.loss_after, 3),
+        ("Position error, cm", e.error_before_cm, e.error_after_cm, 2),
+        ("Rotation error, °", e.rotation_error_before_deg, e.rotation_error_after_deg, 2),
     ]
-    body = "".join(f"<tr><td>{name}</td><td>{before}</td><td><b>{after}</b></td></tr>" for name, before, after in rows)
+    body = "".join(
+        f"<tr><td>{name}</td><td>{theme.number(before, digits)}</td><td><b>{theme.number(after, digits)}</b></td></tr>"
+        for name, before, after, digits in rows
+        if before is not None
+    )
     old = f"keyframe{'s' * (len(e.keyframes) > 1)} {', '.join(map(str, e.keyframes))}"
     return (
         f'<div class="ec"><b>Frame {e.frame} met {old}</b><br>The pose moved by '
