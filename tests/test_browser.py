@@ -34,6 +34,22 @@ def browser():
         yield chromium
 
 
+# The lowest contrast (WCAG 2) of small texts on the status card: each is painted on all that lies behind it.
+CONTRAST = """() => {
+  const pen = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
+  const light = colours => {
+    for (const c of ['white', ...colours]) { pen.fillStyle = c; pen.fillRect(0, 0, 1, 1); }
+    const [r, g, b] = [...pen.getImageData(0, 0, 1, 1).data].map(v => ((v / 255 + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b + 0.05;
+  };
+  const behind = e => e ? [...behind(e.parentElement), getComputedStyle(e).backgroundColor] : [];
+  return Math.min(...[...document.querySelectorAll('.ec-chip, .ec .dim, .ec-cell span, .ec-key span')].map(e => {
+    const [text, ground] = [light([...behind(e), getComputedStyle(e).color]), light(behind(e))];
+    return Math.max(text, ground) / Math.min(text, ground);
+  }));
+}"""
+
+
 class Visit:
     """One tab on a dashboard, with what its console complained about."""
 
@@ -147,6 +163,7 @@ def test_pause_step_resume_and_hot_keys(live):
     before = visit.frame
     visit.page.wait_for_timeout(1500)
     assert visit.frame == before
+    assert visit.page.evaluate(CONTRAST) > 4.5
     visit.press("Step")
     visit.wait(lambda: visit.frame == before + 1)
     visit.page.wait_for_timeout(500)
@@ -305,6 +322,8 @@ def test_usable_on_a_phone(tmp_path, browser):
         assert card["x"] >= 0
         assert card["x"] + card["width"] <= 390
         assert card["width"] > 340
+        assert card["height"] < 240, "it leaves room for the controls"
+        assert visit.page.evaluate(CONTRAST) > 4.5
     finally:
         visit.page.close()
         dashboard.close()
