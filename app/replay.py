@@ -188,27 +188,29 @@ class ReplayEngine:
 
 
 def export(run: Run, command: Export) -> Path:
-    """Write what an ``Export`` asks for into the run's ``exports`` folder. Raises InputError for what there is not."""
+    """Write what an ``Export`` asks for into the run's ``exports`` folder, named after the last frame as a live run
+    does. Raises InputError for what there is not."""
     folder = run.folder / "exports"
     folder.mkdir(parents=True, exist_ok=True)
+    name = f"{command.kind}-{run.last:06d}"
     if command.kind == "mesh" and command.format in ("ply", "glb", "obj") and run.meshes:
-        mesh, path = load_mesh(run.meshes[max(run.meshes)]), folder / f"mesh.{command.format}"
+        mesh, path = load_mesh(run.meshes[max(run.meshes)]), folder / f"{name}.{command.format}"
         path.write_bytes(mesh_bytes(mesh, command.format))
         return path
     if command.kind == "trajectory":
-        path = folder / f"trajectory_{command.format or 'tum'}.txt"
+        path = folder / f"{name}-{command.format or 'tum'}.txt"
         kitti = command.format == "kitti"
         path.write_text(format_kitti(run.trajectory) if kitti else format_tum(run.timestamps, run.trajectory))
         return path
     if command.kind == "keyframes":
-        path = folder / "keyframes.txt"
+        path = folder / f"{name}-tum.txt"
         rows = [run.row_at(keyframe.frame) for keyframe in run.keyframes]
         path.write_text(format_tum(run.timestamps[rows], run.trajectory[rows]))
         return path
     if command.kind == "config" and (run.folder / "config.yaml").is_file():
-        return Path(shutil.copyfile(run.folder / "config.yaml", folder / "config.yaml"))
+        return Path(shutil.copyfile(run.folder / "config.yaml", folder / f"{name}.yaml"))
     if command.kind == "run":
-        return zip_run(run.folder, f"exports/{run.name}.zip")
+        return zip_run(run.folder, f"exports/{name}.zip")
     raise InputError(f"{run.folder}: this run holds no {command.kind} to export")
 
 

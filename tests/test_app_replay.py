@@ -183,6 +183,10 @@ def test_exports(replay, folder):
     with zipfile.ZipFile(events(replay, m.Exported, m.Export("run", "zip"))[0].path) as archive:
         assert {f"lite/{name}" for name in ("metrics.jsonl", "mesh.ply", "summary.json")} <= set(archive.namelist())
         assert not any(name.startswith(("lite/exports", "lite/checkpoints")) for name in archive.namelist())
+    events(replay, m.Exported, m.Export("config"))
+    some = ("config-000039.yaml", "keyframes-000039-tum.txt", "mesh-000039.ply", "run-000039.zip")
+    names = {path.name for path in (folder / "exports").iterdir()}
+    assert names == {*some, "trajectory-000039-tum.txt", "trajectory-000039-kitti.txt"}, "as a live run names them"
 
 
 def test_a_comparison_says_which_path_is_whose(folder):

@@ -205,7 +205,7 @@ def test_exports_arrive_in_the_browser(live, tmp_path):
     assert len((tmp_path / "poses.txt").read_text().splitlines()) == visit.frame + 1
     visit.download("Save screenshot").save_as(tmp_path / "shot.png")
     assert np.asarray(Image.open(tmp_path / "shot.png")).std() > 10
-    assert list((engine.run_folder / "exports").glob("screenshot_*.png"))
+    assert list((engine.run_folder / "exports").glob("screenshot-*.png"))
 
 
 def test_html_replay_plays_by_itself(live, browser, tmp_path):
