@@ -20,7 +20,9 @@ from ecslam_app.panels.status import Panel as Status
 
 from ecslam import config_files
 from ecslam import messages as m
+from ecslam.runtime.engine import Engine
 from tests.fake_engine import FakeEngine, write_run
+from tests.fake_slam import QUICK, FakeSequence, maker
 from tests.test_app_security import control, dial, enter, hit, press, until
 
 PANELS = find_panels()
@@ -180,6 +182,28 @@ def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
         for label, value in wanted.items():
             assert until(lambda label=label, value=value: control(page, label)[1].value == value), label
     finally:
+        page.close()
+
+
+def test_a_restart_takes_back_what_was_tuned(tmp_path):
+    engine = Engine(QUICK, FakeSequence(400), tmp_path / "run", make=maker())
+    engine.submit(m.SpeedLimit(20.0))
+    page = server.start(engine, port=0)
+    slider = control(page, "Mapping iterations")[1]
+    engine.start()
+    try:
+        for again in (m.Restart(), m.LoadPreset(QUICK.preset)):
+            assert until(lambda: page.hub.current is not None and page.hub.current.frame in range(3, 60))
+            with dial(page) as client:
+                enter(client)
+                assert until(lambda: list(page.hub.viewers()))
+                press(page, client, "Mapping iterations", 33)
+                assert until(lambda: engine._control.config.mapping.iterations == 33)
+            engine.submit(again)
+            assert until(lambda: slider.value == engine._control.config.mapping.iterations != 33), again
+    finally:
+        engine.submit(m.Quit())
+        engine.join()
         page.close()
 
 
