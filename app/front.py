@@ -14,6 +14,7 @@ import hmac
 import http
 import io
 import ipaddress
+import logging
 import re
 import socket
 import threading
@@ -39,6 +40,9 @@ MESSAGES_PER_S, BURST = 240.0, 480.0
 
 _LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 _construction = threading.Lock()
+_log = logging.getLogger(f"{__name__}.websockets")
+# A browser that has given up before it is answered, or a scan of ports, is nobody's mistake here.
+_log.addFilter(lambda record: record.getMessage() != "opening handshake failed")
 
 
 @dataclass(frozen=True)
@@ -150,7 +154,7 @@ class _Shell:
                 self._clients -= 1
 
         self.serving = True
-        return serve(attend, sock=self._listener, process_request=answer, **options)
+        return serve(attend, sock=self._listener, process_request=answer, logger=_log, **options)
 
 
 class _Guarded:

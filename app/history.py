@@ -77,7 +77,7 @@ def discrepancy(s: Snapshot, most: int = 400) -> tuple[str, NDArray[np.float64],
             rotation_difference_deg(s.trajectory[pick], s.trajectory_gt[pick]),
         )
     frames = np.array([0, *(e.frame for e in s.loops), max(s.frame, 1)], float)
-    return "Correction (cm)", frames, np.array([0.0, *(e.correction_cm for e in s.loops), 0.0])
+    return "Correction (cm)", frames, np.array([np.nan, *(e.correction_cm for e in s.loops), np.nan])
 
 
 def with_last_mapping(s: Snapshot, last: Snapshot | None) -> Snapshot:

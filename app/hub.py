@@ -60,7 +60,6 @@ class Hub:
         self.replay = engine if isinstance(engine, ReplayEngine) else None
         self.history = History() if self.replay is None else self.replay.history
         self.current: Snapshot | None = None
-        self.follow = False
         self.jobs = ThreadPoolExecutor(2, "dashboard-job")
         self._askers: dict[int, viser.ClientHandle] = {}
         self._under_way: dict[int, viser.NotificationHandle] = {}
@@ -240,16 +239,14 @@ class Hub:
             self.scene.update(s)
             for panel in self.panels:
                 panel.snapshot(s)
-        if self.follow and len(s.trajectory):
-            for client in self.viewers():
-                self.views.follow(client, s.trajectory[-1])
+        if len(s.trajectory):
+            self.views.move_along(s.trajectory[-1])
 
     def _begin(self, s: Snapshot) -> None:
         if self.replay is None:
             self.history = history_of(frame_rows(self.engine.run_folder))
         self.scene.begin(s)
-        for client in self.viewers():
-            self.views.show_all(client, 0.0)
+        self.views.begin()
 
     def _tell(self, message: Event | Ack) -> None:
         if isinstance(message, Ack):
@@ -300,7 +297,7 @@ class Hub:
 
     async def _connected(self, client: viser.ClientHandle) -> None:
         aspect = client.camera.aspect
-        self.post(partial(self.views.welcome, client))
+        self.post(partial(self._welcome, client))
 
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
@@ -308,6 +305,11 @@ class Hub:
             if abs(camera.aspect - aspect) > RESHAPED * aspect:
                 aspect = camera.aspect
                 self.post(partial(self.views.reshaped, client))
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        self.views.welcome(client)
+        for panel in self.panels:
+            panel.viewer()
 
     def _keyframe_clicked(self, client: viser.ClientHandle, index: int) -> None:
         self.post(partial(self._visit, client, index))

@@ -24,15 +24,28 @@ _POLICY = (
     "connect-src 'self' ws://{host} wss://{host} blob: data:; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'none'"
 )
-# A button that was clicked keeps the focus, and the hot key space would press it again: let go of it.
-_LET_GO = "addEventListener('click',e=>{if(e.detail&&e.target.closest('button'))document.activeElement.blur()})"
+# A button that was clicked keeps the focus, and the hot key space would press it again: let go of it. One that the
+# keyboard has reached is pressed with space, which is no hot key then.
+_FOCUS = (
+    "addEventListener('click',e=>{if(e.detail&&e.target.closest('button'))document.activeElement.blur()});"
+    "addEventListener('keydown',e=>{if(e.key===' '&&e.target.closest('button'))e.stopPropagation()},true)"
+)
+# viser's page tries its socket anew every second while the server is away. After some failures a browser holds each
+# try back for longer than that, and the page never returns: let one through only when the server answers, and wait.
+_RETURN = (
+    "let trying=false;const post=Worker.prototype.postMessage;"
+    "Worker.prototype.postMessage=function(message,...rest){const send=()=>post.call(this,message,...rest);"
+    "if(message?.type!=='retry')send();else if(!trying){trying=true;fetch('/up',{cache:'no-store'})"
+    ".then(()=>{send();setTimeout(()=>trying=false,4000)},()=>trying=false)}}"
+)
 
 
 @lru_cache(1)
 def _page() -> tuple[bytes, bytes]:
     text = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text("utf-8")
     head = (
-        f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style><script>{_LET_GO}</script></head>'
+        f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style>'
+        f"<script>{_FOCUS};{_RETURN}</script></head>"
     )
     body = text.replace("<title>Viser</title>", "").replace("</head>", head, 1).encode()
     return body, gzip.compress(body)

@@ -43,6 +43,9 @@ class BasePanel:
     def ack(self, ack: Ack) -> None:
         """React to the engine's answer to a command."""
 
+    def viewer(self) -> None:
+        """A browser has opened the page."""
+
     def keyframe(self, keyframe: KeyframeView) -> None:
         """A viewer has clicked a keyframe's frustum."""
 

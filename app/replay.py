@@ -159,6 +159,7 @@ class ReplayEngine:
             replace(k, c2w=trajectory[at]) for k, at in zip(run.keyframes, self._past.keyframes, strict=True) if at <= i
         )
         mapped = next((r for r in run.rows[i::-1] if r.get("window")), row)
+        at_the_end = run.summary.get("ate_rmse_cm") if frame == run.last else None
         return Snapshot(
             state=state,
             sequence=self.sequences[0],
@@ -177,7 +178,7 @@ class ReplayEngine:
             map_ms=float(mapped.get("map_ms") or 0),
             fps_wall=float(run.summary.get("fps_wall") or 0),
             fps_engine=float(run.summary.get("fps_engine") or 0),
-            ate_cm=row.get("ate_cm"),
+            ate_cm=row.get("ate_cm") if at_the_end is None else at_the_end,
             memory_mb=float(run.summary.get("peak_memory_mb") or 0),
             loops=tuple(e for e in run.loops if e.frame <= frame),
             skipped=int(run.summary.get("skipped_frames") or 0),
@@ -187,27 +188,29 @@ class ReplayEngine:
 
 
 def export(run: Run, command: Export) -> Path:
-    """Write what an ``Export`` asks for into the run's ``exports`` folder. Raises InputError for what there is not."""
+    """Write what an ``Export`` asks for into the run's ``exports`` folder, named after the last frame as a live run
+    does. Raises InputError for what there is not."""
     folder = run.folder / "exports"
     folder.mkdir(parents=True, exist_ok=True)
+    name = f"{command.kind}-{run.last:06d}"
     if command.kind == "mesh" and command.format in ("ply", "glb", "obj") and run.meshes:
-        mesh, path = load_mesh(run.meshes[max(run.meshes)]), folder / f"mesh.{command.format}"
+        mesh, path = load_mesh(run.meshes[max(run.meshes)]), folder / f"{name}.{command.format}"
         path.write_bytes(mesh_bytes(mesh, command.format))
         return path
     if command.kind == "trajectory":
-        path = folder / f"trajectory_{command.format or 'tum'}.txt"
+        path = folder / f"{name}-{command.format or 'tum'}.txt"
         kitti = command.format == "kitti"
         path.write_text(format_kitti(run.trajectory) if kitti else format_tum(run.timestamps, run.trajectory))
         return path
     if command.kind == "keyframes":
-        path = folder / "keyframes.txt"
+        path = folder / f"{name}-tum.txt"
         rows = [run.row_at(keyframe.frame) for keyframe in run.keyframes]
         path.write_text(format_tum(run.timestamps[rows], run.trajectory[rows]))
         return path
     if command.kind == "config" and (run.folder / "config.yaml").is_file():
-        return Path(shutil.copyfile(run.folder / "config.yaml", folder / "config.yaml"))
+        return Path(shutil.copyfile(run.folder / "config.yaml", folder / f"{name}.yaml"))
     if command.kind == "run":
-        return zip_run(run.folder, f"exports/{run.name}.zip")
+        return zip_run(run.folder, f"exports/{name}.zip")
     raise InputError(f"{run.folder}: this run holds no {command.kind} to export")
 
 

@@ -15,7 +15,7 @@ import viser.transforms as vt
 from numpy.typing import NDArray
 
 from ecslam.datasets.meshes import load_mesh
-from ecslam.messages import KeyframeView, LoopEvent
+from ecslam.messages import KeyframeView, LoopEvent, Notice
 from ecslam.runtime.files import read_lines
 from ecslam.types import InputError, Mesh
 
@@ -99,6 +99,12 @@ def load_run(folder: Path) -> Run:
 def frame_rows(folder: Path) -> tuple[dict[str, Any], ...]:
     """A line for each frame that a run folder has on record so far; none where there is no ``metrics.jsonl``."""
     return tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
+
+
+def notices_in(folder: Path) -> list[Notice]:
+    """What a run folder has on record for a person to read, oldest first."""
+    lines = [line for line in read_lines(folder / "events.jsonl") if line.get("type") == "notice"]
+    return [Notice(str(line.get("level")), str(line.get("text")), line.get("frame")) for line in lines]
 
 
 @lru_cache(12)

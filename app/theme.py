@@ -56,13 +56,15 @@ STYLE = """
 .u-legend{font-size:11.5px!important;text-align:left!important}
 .ec-upright{display:none!important}
 .u-title{font-size:12.5px!important;font-weight:600}
-.ec{font-size:12.5px;line-height:1.45;color:var(--mantine-color-text);padding:4px 8px 6px;
+.ec{--dim:color-mix(in srgb,var(--mantine-color-text) 64%,transparent);font-size:12.5px;line-height:1.45;
+  color:var(--mantine-color-text);padding:4px 8px 6px;
   font-variant-numeric:tabular-nums}
 .ec b{font-weight:600}
-.ec .dim{color:var(--mantine-color-dimmed)}
+.ec .dim{color:var(--dim)}
 .ec-head{display:flex;align-items:center;gap:8px;margin-bottom:7px;min-width:0}
 .ec-chip{display:inline-flex;align-items:center;gap:6px;padding:2px 10px 2px 8px;border-radius:999px;font-weight:600;
-  font-size:12px;white-space:nowrap;color:var(--c);background:color-mix(in srgb,var(--c) 14%,transparent)}
+  font-size:12px;white-space:nowrap;color:color-mix(in srgb,var(--c) 55%,var(--mantine-color-text));
+  background:color-mix(in srgb,var(--c) 14%,transparent)}
 .ec-chip i{width:7px;height:7px;border-radius:50%;background:var(--c)}
 .ec-name{flex:1;min-width:0;text-align:right;overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
 .ec-bar{height:5px;border-radius:3px;background:var(--mantine-color-default-border);overflow:hidden;margin:3px 0 9px}
@@ -71,16 +73,16 @@ STYLE = """
 .ec-grid{display:grid;margin-bottom:4px;grid-template-columns:repeat(3,minmax(0,1fr));gap:6px}
 .ec-cell{border:1px solid var(--mantine-color-default-border);border-radius:8px;padding:5px 8px 4px;min-width:0}
 .ec-cell b{display:block;font-size:15px;line-height:1.3;white-space:nowrap;letter-spacing:-.01em}
-.ec-cell span{font-size:10.5px;color:var(--mantine-color-dimmed);white-space:nowrap}
-.ec-cell small{font-size:10.5px;font-weight:500;color:var(--mantine-color-dimmed);margin-left:2px}
-.ec-note{margin:7px 0;padding:6px 9px;border-radius:8px;border-left:3px solid var(--c);
+.ec-cell span{font-size:10.5px;color:var(--dim);white-space:nowrap}
+.ec-cell small{font-size:10.5px;font-weight:500;color:var(--dim);margin-left:2px}
+.ec-note{margin:7px 0;padding:6px 9px;border-radius:8px;border-left:3px solid var(--c);overflow-wrap:anywhere;
   background:color-mix(in srgb,var(--c) 10%,transparent)}
 .ec table{width:100%;border-collapse:collapse}
 .ec td,.ec th{padding:3px 4px;text-align:right;font-weight:400;
   border-bottom:1px solid var(--mantine-color-default-border)}
-.ec td:first-child,.ec th:first-child{text-align:left;color:var(--mantine-color-dimmed)}
+.ec td:first-child,.ec th:first-child{text-align:left;color:var(--dim)}
 .ec th{font-weight:600}
-.ec-key{display:flex;flex-wrap:wrap;gap:3px 10px;font-size:11.5px;color:var(--mantine-color-dimmed)}
+.ec-key{display:flex;flex-wrap:wrap;gap:3px 10px;font-size:11.5px;color:var(--dim)}
 .ec-key i{display:inline-block;width:14px;height:3px;border-radius:2px;margin-right:5px;background:var(--c);
   vertical-align:middle}
 .ec-six{display:grid;grid-template-columns:1fr 1fr;gap:5px}
@@ -89,6 +91,7 @@ STYLE = """
 .ec-six img{width:100%;display:block}
 .ec-six figcaption{position:absolute;left:5px;bottom:4px;font-size:10px;padding:0 6px;border-radius:9px;color:#fff;
   background:#0009}
+@media (max-width:48em){.ec-grid{gap:4px}.ec-cell{padding:2px 7px 1px}.ec-cell b{font-size:13.5px;line-height:1.2}}
 """
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import viser
@@ -18,16 +18,18 @@ FOV_RAD = np.radians(50.0)
 GLIDE_S, GLIDE_STEPS_PER_S = 0.6, 30
 GLIDERS = 4  # with more viewers each one's camera jumps: thirty messages a second to each would cost the engine
 MOVED, WORTH_A_MOVE = 0.02, 0.12
-REMEMBERED = 8
+REMEMBERED, REMEMBERED_BEHIND = 8, 40
 
 
 @dataclass(frozen=True)
 class _Framing:
-    """Where the page has put a viewer's camera. way: [k, 3] the places on the way there, the last one ``position``."""
+    """Where the page has put a viewer's camera. way: [k, 3] the places on the way there, the last one ``position``;
+    follows: it goes behind the run's camera, else it has everything in sight."""
 
     position: Array
     look_at: Array
     way: Array
+    follows: bool = False
 
     def left(self, client: viser.ClientHandle) -> bool:
         """Whether the viewer has taken the camera off the way; however late a browser reports, it reports places on
@@ -51,13 +53,18 @@ class Views:
             client.camera.fov = FOV_RAD
             self.show_all(client, 0.0)
 
+    def begin(self) -> None:
+        """A new run: bring it into everybody's sight; who follows goes on with that when its camera is known."""
+        for client in self._server.get_clients().values():
+            framing = self._framed.get(client.client_id)
+            self.show_all(client, 0.0)
+            if framing is not None and framing.follows:
+                self._framed[client.client_id] = replace(self._framed[client.client_id], follows=True)
+
     def show_all(self, client: viser.ClientHandle, seconds: float = GLIDE_S) -> None:
         """Bring everything into one viewer's sight, and keep it there as the map grows."""
         place = self._all(client)
-        framing = self._framed.get(client.client_id)
-        before = [] if framing is None or framing.left(client) else list(framing.way)
-        way = np.stack([*before, np.array(client.camera.position), place[0]])
-        self._framed[client.client_id] = _Framing(*place, way[-REMEMBERED:])
+        self._framed[client.client_id] = _Framing(*place, self._way(client, place[0], REMEMBERED))
         self._fly(client, *place, seconds)
 
     def keep_framed(self) -> None:
@@ -68,6 +75,7 @@ class Views:
             client, distance = clients[number], np.linalg.norm(framing.position - framing.look_at)
             if framing.left(client):
                 del self._framed[number]
+            if framing.left(client) or framing.follows:
                 continue
             position, look_at = self._all(client)
             away = max(np.linalg.norm(position - framing.position), np.linalg.norm(look_at - framing.look_at))
@@ -77,7 +85,7 @@ class Views:
     def reshaped(self, client: viser.ClientHandle) -> None:
         """A viewer's window has another shape: frame everything anew where the camera has been left to the page."""
         framing = self._framed.get(client.client_id)
-        if framing is not None and not framing.left(client):
+        if framing is not None and not framing.follows and not framing.left(client):
             self.show_all(client, 0.0)
 
     def show(self, client: viser.ClientHandle, points: Array) -> None:
@@ -91,9 +99,24 @@ class Views:
         self._fly(client, *behind(c2w, self._scene.up, 0.45), GLIDE_S)
 
     def follow(self, client: viser.ClientHandle, c2w: Array) -> None:
-        """Put one viewer just behind the camera."""
-        self._leave(client)
-        _place(client, *behind(c2w, self._scene.up))
+        """Put one viewer just behind the run's camera, and keep it there until the viewer moves or goes elsewhere."""
+        place = behind(c2w, self._scene.up)
+        way = self._way(client, place[0], REMEMBERED_BEHIND)
+        self._framed[client.client_id] = _Framing(*place, way, follows=True)
+        _place(client, *place)
+
+    def move_along(self, c2w: Array) -> None:
+        """The run's camera has moved: so do the viewers that follow it."""
+        for client in self._server.get_clients().values():
+            framing = self._framed.get(client.client_id)
+            if framing is not None and framing.follows and not framing.left(client):
+                self.follow(client, c2w)
+
+    def _way(self, client: viser.ClientHandle, position: Array, most: int) -> Array:
+        """The last places [k, 3] that the page has put a viewer at, then where it is and where it goes."""
+        framing = self._framed.get(client.client_id)
+        before = [] if framing is None or framing.left(client) else list(framing.way)
+        return np.stack([*before, np.array(client.camera.position), position])[-most:]
 
     def _leave(self, client: viser.ClientHandle) -> None:
         self._framed.pop(client.client_id, None)

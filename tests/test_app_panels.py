@@ -13,12 +13,16 @@ import pytest
 import viser
 from ecslam_app import server
 from ecslam_app.panel import TABS, BasePanel, find_panels
+from ecslam_app.panels.loops import Panel as Loops
+from ecslam_app.panels.notices import Panel as Notices
 from ecslam_app.panels.status import WORDS, render
 from ecslam_app.panels.status import Panel as Status
 
 from ecslam import config_files
 from ecslam import messages as m
+from ecslam.runtime.engine import Engine
 from tests.fake_engine import FakeEngine, write_run
+from tests.fake_slam import QUICK, FakeSequence, maker
 from tests.test_app_security import control, dial, enter, hit, press, until
 
 PANELS = find_panels()
@@ -181,6 +185,28 @@ def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
         page.close()
 
 
+def test_a_restart_takes_back_what_was_tuned(tmp_path):
+    engine = Engine(QUICK, FakeSequence(400), tmp_path / "run", make=maker())
+    engine.submit(m.SpeedLimit(20.0))
+    page = server.start(engine, port=0)
+    slider = control(page, "Mapping iterations")[1]
+    engine.start()
+    try:
+        for again in (m.Restart(), m.LoadPreset(QUICK.preset)):
+            assert until(lambda: page.hub.current is not None and page.hub.current.frame in range(3, 60))
+            with dial(page) as client:
+                enter(client)
+                assert until(lambda: list(page.hub.viewers()))
+                press(page, client, "Mapping iterations", 33)
+                assert until(lambda: engine._control.config.mapping.iterations == 33)
+            engine.submit(again)
+            assert until(lambda: slider.value == engine._control.config.mapping.iterations != 33), again
+    finally:
+        engine.submit(m.Quit())
+        engine.join()
+        page.close()
+
+
 def test_the_slider_of_a_replay_follows_wherever_it_goes(replay_page):
     slider = control(replay_page, "Frame")[1]
     replay_page.engine.submit(m.RunTo(11))
@@ -213,6 +239,72 @@ def test_the_plots_of_a_replay_mark_the_frame_that_is_shown(replay_page):
     assert frames[np.isfinite(values)].tolist() == sorted([*range(30), 23])
     assert upright[np.isfinite(upright)].tolist() == [0.0, chart._plot.scales["y"]["range"][1]]
     assert len(chart._plot.series) == 3
+
+
+def test_a_loop_is_inspected_only_while_it_has_happened(replay_page):
+    choice, scene = control(replay_page, "Loop event")[1], replay_page.hub.scene
+    with dial(replay_page) as client:
+        enter(client)
+        for frame, inspected in ((29, True), (20, False), (29, False)):
+            replay_page.engine.submit(m.RunTo(frame))
+            assert until(lambda frame=frame: replay_page.hub.current.frame == frame)
+            if inspected:
+                press(replay_page, client, "Go to", "Next event")
+                assert until(lambda: scene._inspected is not None)
+            assert until(lambda inspected=inspected: (scene._inspected is not None) == inspected)
+            assert choice.value.startswith("Frame 27") == inspected
+
+
+def test_without_ground_truth_nothing_on_the_page_speaks_of_it(tmp_path):
+    engine = FakeEngine(tmp_path / "run", frames=60, truth=False).skip_to(50)
+    page = server.start(engine, port=0)
+    loops, status = (next(p for p in page.hub.panels if isinstance(p, kind)) for kind in (Loops, Status))
+    try:
+        assert until(lambda: page.hub.current is engine.latest())
+        assert not loops._chart.visible, "no loop, nothing to plot"
+        engine.skip_to(59)
+        assert until(lambda: page.hub.current is engine.latest())
+        assert until(lambda: loops._chart.visible)
+        assert loops._chart._plot.title == "Correction (cm)"
+        frames, values, marks = loops._chart._plot.data
+        assert frames[np.isfinite(values)].tolist() == frames[np.isfinite(marks)].tolist() == [54]
+        assert "ground truth" not in status._html.content
+    finally:
+        page.close()
+
+
+def test_the_plots_say_that_there_is_nothing_yet(engine, page):
+    plots = next(p for p in page.hub.panels if p.tab == "Plots")
+    for frame, empty in ((0, True), (5, False)):
+        engine.skip_to(frame)
+        assert until(lambda: page.hub.current is engine.latest())
+        assert until(lambda empty=empty: plots._none.visible == empty)
+
+
+def test_notices_stay_on_the_page_until_a_restart(engine, page):
+    html = next(p for p in page.hub.panels if isinstance(p, Notices))._html
+    assert not html.visible
+    for frame in range(12):
+        engine._feed.publish(m.Notice("warning", "skipped: <cut> short", frame))
+    engine._feed.publish(m.Notice("error", "metrics.jsonl could not be saved (No space left on device)"))
+    assert until(lambda: "No space left on device" in html.content)
+    assert html.visible
+    assert html.content.index("No space") < html.content.index("Frame 11: skipped: &lt;cut&gt; short")
+    assert "Frame 4:" not in html.content
+    assert "and 5 before these, in events.jsonl" in html.content
+    engine.start().submit(m.Restart())
+    assert until(lambda: not html.visible)
+
+
+def test_a_finished_run_shows_its_notices(tmp_path):
+    run = write_run(tmp_path / "a", 30)
+    with (run / "events.jsonl").open("a") as log:
+        log.write('{"type":"notice","level":"warning","text":"lost","frame":7}\n')
+    page = server.view([run], port=0)
+    try:
+        assert "Frame 7: lost" in next(p for p in page.hub.panels if isinstance(p, Notices))._html.content
+    finally:
+        page.close()
 
 
 def test_the_space_key_plays_and_pauses_a_replay(replay_page):
@@ -286,6 +378,14 @@ def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, pag
         panel._asked -= 2.0
         panel.event(pictures)
         assert 60 < panel._pause_s < 80, "what somebody asked for says nothing about the time it takes"
+
+
+def test_a_page_opened_while_the_run_stands_still_shows_pictures(engine, page):
+    engine.skip_to(10).start()
+    assert until(lambda: page.hub.current is engine.latest())
+    with dial(page) as client:
+        enter(client)
+        assert until(lambda: m.RequestPictures() in engine.log)
 
 
 def test_a_replay_shows_the_pictures_that_its_run_kept(replay_page, engine):

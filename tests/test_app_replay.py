@@ -84,6 +84,12 @@ def test_scrubbing_shows_what_was_there_at_that_frame(replay, frame):
     assert set(s.window) <= {k.frame for k in s.keyframes}
 
 
+def test_the_error_at_the_end_is_the_one_of_the_summary(replay):
+    assert replay.latest().ate_cm == replay.run.summary["ate_rmse_cm"]
+    events(replay, m.Snapshot, m.RunTo(FRAMES - 2))
+    assert replay.latest().ate_cm == replay.run.rows[FRAMES - 2]["ate_cm"]
+
+
 def test_a_run_with_skipped_frames_is_shown_by_frame_number(folder, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(folder, run)
@@ -179,6 +185,10 @@ def test_exports(replay, folder):
     with zipfile.ZipFile(events(replay, m.Exported, m.Export("run", "zip"))[0].path) as archive:
         assert {f"lite/{name}" for name in ("metrics.jsonl", "mesh.ply", "summary.json")} <= set(archive.namelist())
         assert not any(name.startswith(("lite/exports", "lite/checkpoints")) for name in archive.namelist())
+    events(replay, m.Exported, m.Export("config"))
+    some = ("config-000039.yaml", "keyframes-000039-tum.txt", "mesh-000039.ply", "run-000039.zip")
+    names = {path.name for path in (folder / "exports").iterdir()}
+    assert names == {*some, "trajectory-000039-tum.txt", "trajectory-000039-kitti.txt"}, "as a live run names them"
 
 
 def test_a_comparison_says_which_path_is_whose(folder):

@@ -251,6 +251,15 @@ def test_garbage_does_not_end_the_connection(open_page, engine):
         assert alive(open_page, client, engine)
 
 
+def test_who_hangs_up_before_the_answer_leaves_no_trace_on_the_terminal(open_page, caplog):
+    for begun in (b"", b"GET / HTTP/1.1\r\nHost: loc", b"\x16\x03\x01 TLS"):
+        with socket.create_connection(("127.0.0.1", open_page.port)) as caller:
+            caller.sendall(begun)
+    get(open_page)
+    time.sleep(0.5)
+    assert "handshake" not in caplog.text
+
+
 def test_busy_port_is_a_clear_error(engine):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

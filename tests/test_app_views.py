@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ecslam_app import server, views
+from ecslam_app.geometry import behind
 
 from tests.fake_engine import FakeEngine
-from tests.test_app_security import CAMERA, dial, enter, say, until
+from tests.test_app_security import CAMERA, dial, enter, press, say, until
 
 BOX = np.array(np.meshgrid([-2.0, 2], [-2.0, 2], [0.0, 2])).reshape(3, -1).T
 
@@ -101,3 +102,31 @@ def test_flying_to_a_keyframe_ends_the_framing(page, viewer):
     assert until(lambda: np.linalg.norm(client.camera.position) < 1)
     grow(page, 2)
     assert np.linalg.norm(client.camera.position) < 1
+
+
+def test_who_follows_the_camera_goes_along_until_he_moves(page, viewer):
+    connection, client = viewer
+    with dial(page) as other:
+        enter(other)
+        assert until(lambda: len(list(page.hub.viewers())) == 2)
+        bystander = next(c for c in page.hub.viewers() if c.client_id != client.client_id)
+        assert until(lambda: bystander.client_id in page.hub.views._framed)
+        before = np.array(bystander.camera.position)
+        page.engine.skip_to(5)
+        assert until(lambda: page.hub.current is page.engine.latest())
+        press(page, connection, "Follow camera", True)
+        for frame in (10, 20):
+            c2w = page.engine.skip_to(frame).latest().trajectory[-1]
+            assert until(lambda c2w=c2w: np.allclose(client.camera.position, behind(c2w, page.hub.scene.up)[0]))
+            grow(page, frame)
+            assert np.allclose(client.camera.position, behind(c2w, page.hub.scene.up)[0])
+        page.hub.post(page.hub.views.begin)
+        c2w = page.engine.skip_to(21).latest().trajectory[-1]
+        assert until(lambda: np.allclose(client.camera.position, behind(c2w, page.hub.scene.up)[0])), "in a new run too"
+        say(connection, "ViewerCameraMessage", **{**CAMERA, "position": [1.0, 2.0, 3.0]})
+        assert until(lambda: np.allclose(client.camera.position, [1, 2, 3]))
+        page.engine.skip_to(30)
+        assert until(lambda: page.hub.current.frame == 30)
+        grow(page, 1)
+        assert np.allclose(client.camera.position, [1, 2, 3])
+        assert np.linalg.norm(bystander.camera.position) > np.linalg.norm(before), "it has everything in sight"

@@ -34,6 +34,22 @@ def browser():
         yield chromium
 
 
+# The lowest contrast (WCAG 2) of small texts on the status card: each is painted on all that lies behind it.
+CONTRAST = """() => {
+  const pen = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
+  const light = colours => {
+    for (const c of ['white', ...colours]) { pen.fillStyle = c; pen.fillRect(0, 0, 1, 1); }
+    const [r, g, b] = [...pen.getImageData(0, 0, 1, 1).data].map(v => ((v / 255 + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b + 0.05;
+  };
+  const behind = e => e ? [...behind(e.parentElement), getComputedStyle(e).backgroundColor] : [];
+  return Math.min(...[...document.querySelectorAll('.ec-chip, .ec .dim, .ec-cell span, .ec-key span')].map(e => {
+    const [text, ground] = [light([...behind(e), getComputedStyle(e).color]), light(behind(e))];
+    return Math.max(text, ground) / Math.min(text, ground);
+  }));
+}"""
+
+
 class Visit:
     """One tab on a dashboard, with what its console complained about."""
 
@@ -147,6 +163,7 @@ def test_pause_step_resume_and_hot_keys(live):
     before = visit.frame
     visit.page.wait_for_timeout(1500)
     assert visit.frame == before
+    assert visit.page.evaluate(CONTRAST) > 4.5
     visit.press("Step")
     visit.wait(lambda: visit.frame == before + 1)
     visit.page.wait_for_timeout(500)
@@ -155,8 +172,14 @@ def test_pause_step_resume_and_hot_keys(live):
     visit.page.keyboard.press("n")
     visit.wait(lambda: visit.frame == before + 2)
     visit.state("Paused")
+    visit.page.get_by_role("button", name="Step", exact=True).focus()
     visit.page.keyboard.press("Space")
-    visit.wait(lambda: visit.frame > before + 4)
+    visit.wait(lambda: visit.frame == before + 3)
+    visit.page.wait_for_timeout(1000)
+    assert visit.frame == before + 3, "space presses the button that has the focus and no more"
+    visit.page.mouse.click(300, 300)
+    visit.page.keyboard.press("Space")
+    visit.wait(lambda: visit.frame > before + 5)
     visit.press("Pause")
     visit.state("Paused")
 
@@ -182,7 +205,7 @@ def test_exports_arrive_in_the_browser(live, tmp_path):
     assert len((tmp_path / "poses.txt").read_text().splitlines()) == visit.frame + 1
     visit.download("Save screenshot").save_as(tmp_path / "shot.png")
     assert np.asarray(Image.open(tmp_path / "shot.png")).std() > 10
-    assert list((engine.run_folder / "exports").glob("screenshot_*.png"))
+    assert list((engine.run_folder / "exports").glob("screenshot-*.png"))
 
 
 def test_html_replay_plays_by_itself(live, browser, tmp_path):
@@ -268,6 +291,24 @@ def test_page_survives_a_lost_connection(live):
     visit.errors.clear()  # the browser itself reports the lost socket
 
 
+def test_page_comes_back_when_the_server_does(tmp_path, browser):
+    engine = FakeEngine(tmp_path / "run", frames=400, period=0.25).skip_to(20).start()
+    dashboard = server.start(engine, port=0)
+    visit = Visit(browser, dashboard, 600, 400)
+    dashboard.close()
+    for _ in range(60):  # as many failures as a minute brings: from now on the browser holds each try back for seconds
+        visit.page.evaluate("void new WebSocket(location.origin.replace('http', 'ws'))")
+    visit.page.wait_for_timeout(8000)
+    engine.skip_to(30)
+    dashboard = server.start(engine, port=dashboard.port)
+    try:
+        visit.wait(lambda: visit.frame == 30, 20)
+    finally:
+        visit.page.close()
+        dashboard.close()
+        engine.stop()
+
+
 def test_usable_on_a_phone(tmp_path, browser):
     engine = FakeEngine(tmp_path / "run", frames=2000, period=0.25).start()
     dashboard = server.start(engine, port=0, dark=True)
@@ -281,6 +322,8 @@ def test_usable_on_a_phone(tmp_path, browser):
         assert card["x"] >= 0
         assert card["x"] + card["width"] <= 390
         assert card["width"] > 340
+        assert card["height"] < 240, "it leaves room for the controls"
+        assert visit.page.evaluate(CONTRAST) > 4.5
     finally:
         visit.page.close()
         dashboard.close()

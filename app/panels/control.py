@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from ecslam.config import Config
 from ecslam.config_files import load_config, load_preset
 from ecslam.messages import (
+    Ack,
     Command,
     LoadPreset,
     Pause,
@@ -42,7 +44,7 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
-        self._shown_preset = ""
+        self._shown: tuple[Path | None, str] = None, ""
         gui = hub.server.gui
         self._verbs = gui.add_button_group("Run", tuple(_VERBS), hint="Space pauses and resumes, n goes one step")
         hub.commands(self._verbs, lambda: _VERBS[self._verbs.value])
@@ -60,9 +62,14 @@ class Panel(BasePanel):
         if self._until.max != s.frames_total - 1:
             self._until.max = s.frames_total - 1
             put(self._until, s.frames_total // 2)
-        if s.preset != self._shown_preset:
-            self._show_preset(s.preset)
+        if (self.hub.engine.run_folder, s.preset) != self._shown:
+            self._show_settings(self.hub.engine.run_folder, s.preset)
         self._offer(s.state not in OVER)
+
+    def ack(self, ack: Ack) -> None:
+        """The preset that is in force already takes back what was tuned."""
+        if isinstance(ack.command, LoadPreset) and not ack.error:
+            self._shown = self._shown[0], ""
 
     def _offer(self, steering: bool) -> None:
         """Show what steers a run as usable or not; viser cannot disable a group of buttons, so that one goes."""
@@ -112,11 +119,12 @@ class Panel(BasePanel):
     def _tune(self, key: str, event: Any) -> None:
         self.hub.submit(Tune(key, int(event.target.value)), event.client)
 
-    def _show_preset(self, name: str) -> None:
-        first, self._shown_preset = not self._shown_preset, name
-        if name in self._preset.options:
-            put(self._preset, name)
-        config = self._given() if first else _preset(name)
+    def _show_settings(self, folder: Path, preset: str) -> None:
+        """The settings in force: what a run was given when it began, or those of the preset it went on with."""
+        if preset in self._preset.options:
+            put(self._preset, preset)
+        config = self._given() if folder != self._shown[0] else _preset(preset)
+        self._shown = folder, preset
         for key, slider in self._iterations.items():
             iterations = getattr(config, key.split(".")[0]).iterations
             put(slider, min(max(iterations, int(slider.min)), int(slider.max)))

@@ -80,13 +80,13 @@ class Panel(BasePanel):
     def _screenshot(self, client: Any) -> Path:
         height, width = client.camera.image_height, client.camera.image_width
         picture = client.get_render(height, width, transport_format="png", timeout=SCREENSHOT_TIMEOUT_S)
-        path = self._path("screenshot_{frame:06d}.png")
+        path = self._path("screenshot-{frame:06d}.png")
         iio.imwrite(path, picture)
         return path
 
     def _replay(self, client: Any) -> Path:
         if self.hub.current is None:
             raise RuntimeError("there is nothing to replay before the first frame")
-        path = self._path("replay_{frame:06d}.html")
+        path = self._path("replay-{frame:06d}.html")
         path.write_text(html_replay(self.hub.current, self.hub.scene.mesh, self.hub.history, self.hub.dark), "utf-8")
         return path

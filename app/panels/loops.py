@@ -27,6 +27,7 @@ class Panel(BasePanel):
         super().__init__(hub)
         gui = hub.server.gui
         self._events: tuple[LoopEvent, ...] = ()
+        self._inspected: LoopEvent | None = None
         self._chart = Chart(hub, "Rotation error (°)", markers=True)
         self._choice = gui.add_dropdown("Loop event", (NONE,), initial_value=NONE)
         hub.on(self._choice, lambda event: self._inspect(event.client))
@@ -40,14 +41,17 @@ class Panel(BasePanel):
             hub.on(pause, lambda event: hub.submit(PauseOnLoop(bool(pause.value)), event.client))
 
     def snapshot(self, s: Snapshot) -> None:
-        if len(s.loops) != len(self._events):
-            self._events = s.loops
-            self._choice.options = (NONE, *(_name(e) for e in s.loops))
+        names = (NONE, *map(_name, s.loops))
+        if names != self._choice.options:
+            self._events, self._choice.options = s.loops, names
+            if self._inspected is not None and _name(self._inspected) not in names:
+                self._inspect(None)
         title, frames, values = discrepancy(s)
         marks = np.full(len(frames), np.nan)
         for event in s.loops:
             at = int(np.argmin(np.abs(frames - event.frame)))
             marks[at] = np.nan_to_num(values[at])
+        self._chart.entitle(title)
         self._chart.show([title, "loop closed"], (frames, values, marks), s.frame)
 
     def _move(self, step: int, client: Any) -> None:
@@ -59,7 +63,7 @@ class Panel(BasePanel):
 
     def _inspect(self, client: Any) -> None:
         event = next((e for e in self._events if _name(e) == self._choice.value), None)
-        s = self.hub.current
+        self._inspected, s = event, self.hub.current
         self.hub.scene.inspect(event, self.hub.history.window_at(event.frame) if event else ())
         self._html.content = _intro() if event is None else _figures(event)
         if s is None:
@@ -83,11 +87,15 @@ def _intro() -> str:
 
 def _figures(e: LoopEvent) -> str:
     rows = [
-        ("Weighted loss", theme.number(e.loss_before, 3), theme.number(e.loss_after, 3)),
-        ("Position error, cm", theme.number(e.error_before_cm), theme.number(e.error_after_cm)),
-        ("Rotation error, °", theme.number(e.rotation_error_before_deg), theme.number(e.rotation_error_after_deg)),
+        ("Weighted loss", e.loss_before, e.loss_after, 3),
+        ("Position error, cm", e.error_before_cm, e.error_after_cm, 2),
+        ("Rotation error, °", e.rotation_error_before_deg, e.rotation_error_after_deg, 2),
     ]
-    body = "".join(f"<tr><td>{name}</td><td>{before}</td><td><b>{after}</b></td></tr>" for name, before, after in rows)
+    body = "".join(
+        f"<tr><td>{name}</td><td>{theme.number(before, digits)}</td><td><b>{theme.number(after, digits)}</b></td></tr>"
+        for name, before, after, digits in rows
+        if before is not None
+    )
     old = f"keyframe{'s' * (len(e.keyframes) > 1)} {', '.join(map(str, e.keyframes))}"
     return (
         f'<div class="ec"><b>Frame {e.frame} met {old}</b><br>The pose moved by '

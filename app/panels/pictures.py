@@ -50,6 +50,11 @@ class Panel(BasePanel):
             self._asked, self._asked_frame, self._waiting = time.monotonic(), s.frame, True
             self.hub.submit(RequestPictures())
 
+    def viewer(self) -> None:
+        """A run that stands still sends no snapshot that would bring pictures."""
+        if self.hub.current is not None:
+            self.snapshot(self.hub.current)
+
     def event(self, event: Event) -> None:
         if isinstance(event, FramePictures):
             if self._waiting:

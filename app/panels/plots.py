@@ -34,7 +34,7 @@ class Chart:
     def __init__(self, hub: Hub, title: str, markers: bool = False, peaks: bool = True) -> None:
         """markers: the last series is points only. peaks: rare high values stay within the range.
 
-        A chart is out of sight until it has something to show.
+        A chart is out of sight while it has nothing to show.
         """
         self._gui, self._names, self._markers, self._peaks = hub.server.gui, [""], markers, peaks
         self._upright = (_UPRIGHT,) if hub.replay is not None else ()
@@ -51,11 +51,22 @@ class Chart:
             visible=False,
         )
 
+    @property
+    def visible(self) -> bool:
+        """Whether it shows anything."""
+        return bool(self._plot.visible)
+
+    def entitle(self, title: str) -> None:
+        """Name the chart anew."""
+        if self._plot.title != title:
+            self._plot.title = title
+
     def show(self, names: list[str], columns: tuple[NDArray[np.float64], ...], frame: int) -> None:
         """Draw columns (frame numbers first) under ``names``, with an explicit range. frame: the one that is shown."""
         names = [n for n, column in zip(names, columns[1:], strict=True) if np.isfinite(column).any()]
         columns = (columns[0], *(c for c in columns[1:] if np.isfinite(c).any()))
-        if not names or len(columns[0]) < 2:
+        self._plot.visible = bool(names) and len(columns[0]) > 1
+        if not self._plot.visible:
             return
         if names != self._names:
             self._names = names
@@ -67,7 +78,6 @@ class Chart:
         top = high * 1.08 + 1e-6
         if self._upright:
             columns = with_upright(columns, frame, top)
-        self._plot.visible = True
         self._plot.scales = {
             "x": uplot.Scale(time=False, range=(float(columns[0][0]), float(columns[0][-1]))),
             "y": uplot.Scale(range=(0.0, top)),
@@ -82,6 +92,9 @@ class Panel(BasePanel):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
+        self._none = hub.server.gui.add_html(
+            theme.card('<span class="dim">Nothing to plot before the second frame.</span>')
+        )
         self._error = Chart(hub, "Error so far (ATE, cm)")
         self._losses = Chart(hub, "Weighted losses")
         self._residual = Chart(hub, "Alignment residual (mm)")
@@ -102,6 +115,7 @@ class Panel(BasePanel):
             self._losses.show(list(map(_label, losses)), history.series(losses), s.frame)
             self._residual.show(list(map(_label, residual)), history.series(residual), s.frame)
             self._times.show(["tracking", "mapping"], history.series(["track_ms", "map_ms"]), s.frame)
+            self._none.visible = not self._times.visible
 
 
 def with_upright(columns: tuple[NDArray[np.float64], ...], frame: int, top: float) -> tuple[NDArray[np.float64], ...]:

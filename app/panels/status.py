@@ -21,15 +21,13 @@ WORDS = {
     State.FINISHED: "Finished",
     State.FAILED: "Failed",
 }
-_LEGEND = theme.legend(
-    [
-        ("estimate", theme.ESTIMATE),
-        ("ground truth", theme.TRUTH),
-        ("keyframe", theme.KEYFRAME),
-        ("window", theme.WINDOW),
-        ("loop", theme.LOOP),
-    ]
-)
+_LINES = {
+    "estimate": theme.ESTIMATE,
+    "ground truth": theme.TRUTH,
+    "keyframe": theme.KEYFRAME,
+    "window": theme.WINDOW,
+    "loop": theme.LOOP,
+}
 _COMING = {
     Pause: "Pausing …",
     Stop: "Stopping …",
@@ -87,13 +85,15 @@ def render(s: Snapshot | None, coming: str) -> str:
         theme.cell(str(len(s.window)), "", "in BA window"),
         theme.cell(str(len(s.loops)), "", "loops closed"),
     ]
+    lines = [line for line in _LINES.items() if line[0] != "ground truth" or s.trajectory_gt is not None]
+    name = f"{escape(s.sequence)} · {escape(s.preset)}"
     notes = [theme.note(s.reason, color)] if s.reason else []
     if s.skipped or s.lost_frames:
         notes.append(theme.note(f"{s.skipped} frames skipped, {s.lost_frames} frames lost", theme.ESTIMATE))
     return (
         f'<div class="ec"><div class="ec-head">{theme.chip(coming or WORDS[s.state], color)}'
-        f'<span class="ec-name dim">{escape(s.sequence)} · {escape(s.preset)}</span></div>'
+        f'<span class="ec-name dim" title="{name}">{name}</span></div>'
         f'<div class="ec-row"><span>Frame <b>{s.frame}</b></span><span class="dim">{s.frame + 1} of {s.frames_total}, '
         f'{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
-        f'<div class="ec-grid">{"".join(cells)}</div>{_LEGEND}{"".join(notes)}</div>'
+        f'<div class="ec-grid">{"".join(cells)}</div>{theme.legend(lines)}{"".join(notes)}</div>'
     )

@@ -16,7 +16,7 @@ from ..scene import MESH_MODES
 
 
 class Panel(BasePanel):
-    """View options; shared by all viewers except Reset view."""
+    """View options, shared by all viewers; the buttons move the view of who presses them."""
 
     tab, order = "View", 10
 
@@ -38,14 +38,16 @@ class Panel(BasePanel):
         for label, group in (("Ground truth", "trajectory/ground truth"), ("Keyframes", "keyframes")):
             layer = gui.add_checkbox(label, True)
             hub.on(layer, partial(self._set_layer, group))
-        follow = gui.add_checkbox("Follow camera", False)
-        hub.on(follow, lambda event: self._set_follow(bool(follow.value)))
-        hub.on(
-            gui.add_button("Reset view", icon=viser.Icon.FOCUS_CENTERED, color="gray"),
-            lambda event: hub.views.show_all(event.client),
-        )
         dark = gui.add_checkbox("Dark", hub.dark)
         hub.on(dark, lambda event: self._set_dark(bool(dark.value)))
+        follow = gui.add_button(
+            "Follow camera", icon=viser.Icon.VIDEO, color="gray", hint="For you alone, until you move the view"
+        )
+        hub.on(follow, lambda event: self._follow(event.client))
+        reset = gui.add_button(
+            "Reset view", icon=viser.Icon.FOCUS_CENTERED, color="gray", hint="For you alone: everything in sight"
+        )
+        hub.on(reset, lambda event: hub.views.show_all(event.client))
 
     def _set_layer(self, group: str, event: Any) -> None:
         self.hub.scene.set_visible(group, bool(event.target.value))
@@ -53,11 +55,11 @@ class Panel(BasePanel):
     def _set_mode(self, mode: str) -> None:
         self.hub.scene.set_mode(mode)
 
-    def _set_follow(self, on: bool) -> None:
-        self.hub.follow = on
-        if on and self.hub.current is not None and len(self.hub.current.trajectory):
-            for client in self.hub.viewers():
-                self.hub.views.follow(client, self.hub.current.trajectory[-1])
+    def _follow(self, client: viser.ClientHandle) -> None:
+        if self.hub.current is not None and len(self.hub.current.trajectory):
+            self.hub.views.follow(client, self.hub.current.trajectory[-1])
+        else:
+            self.hub.toast("Not done", "there is no camera to follow before the first frame is done", "red", client)
 
     def _set_dark(self, on: bool) -> None:
         self.hub.dark = on

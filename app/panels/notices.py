@@ -1,0 +1,53 @@
+"""What a person should read about the run: frames skipped, tracking lost, files that could not be saved."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from ecslam.messages import Ack, Event, Notice, Restart
+
+from .. import theme
+from ..hub import Hub
+from ..panel import BasePanel
+from ..runs import notices_in
+
+MOST = 8
+_COLORS = {"error": theme.BEFORE, "warning": theme.ESTIMATE}
+
+
+class Panel(BasePanel):
+    """The newest notices: a toast is gone after some seconds, and who opens the page later has not seen it."""
+
+    tab, order = "Run", 90
+
+    def __init__(self, hub: Hub) -> None:
+        super().__init__(hub)
+        noted = notices_in(hub.engine.run_folder)
+        self._newest, self._count = deque(noted, MOST), len(noted)
+        self._html = hub.server.gui.add_html(self._text(), visible=self._count > 0)
+
+    def event(self, event: Event) -> None:
+        if isinstance(event, Notice) and event not in self._newest:
+            self._newest.append(event)
+            self._count += 1
+            self._show()
+
+    def ack(self, ack: Ack) -> None:
+        """A restart goes into a folder of its own, and begins without the notices of the run before."""
+        if isinstance(ack.command, Restart) and not ack.error:
+            self._newest.clear()
+            self._count = 0
+            self._show()
+
+    def _show(self) -> None:
+        self._html.content, self._html.visible = self._text(), self._count > 0
+
+    def _text(self) -> str:
+        notes = [theme.note(_words(n), _COLORS.get(n.level, theme.KEYFRAME)) for n in reversed(self._newest)]
+        earlier = self._count - len(self._newest)
+        more = f'<span class="dim">and {earlier} before these, in events.jsonl</span>' if earlier else ""
+        return theme.card(f"<b>Notices</b>{''.join(notes)}{more}")
+
+
+def _words(notice: Notice) -> str:
+    return notice.text if notice.frame is None else f"Frame {notice.frame}: {notice.text}"
