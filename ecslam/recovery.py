@@ -46,8 +46,8 @@ class Recovery:
         self.note = ""
         trusted = not self.lost and self._plausible(track, last)
         if not trusted or track.fit < (DOUBT_SHARE * self.usual_fit or DOUBT_FIT):
-            found, enough = relocalise(), max(FOUND_FIT, FOUND_SHARE * self.usual_fit)
-            if found is not None and (found.fit > track.fit if trusted else found.fit >= enough):
+            found, known = relocalise(), track.fit if trusted else 0.0
+            if found is not None and found.fit >= max(FOUND_FIT, FOUND_SHARE * self.usual_fit, known):
                 self.note = "relocalised" if self.lost else "recovered"
                 track, trusted = found, True
         if trusted:
