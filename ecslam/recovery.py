@@ -17,6 +17,7 @@ from .tracker import TrackResult, track_direct
 
 LOST_FIT = 0.25
 LOST_SHARE, FOUND_SHARE = 0.6, 0.92  # of the usual fit: a wrong place can be made to explain 85 % of it
+DOUBT_SHARE, DOUBT_FIT = 0.9, 0.8  # a frame tracked well has over 96 % of it; before there is a usual one, the latter
 USUAL_OVER = 10
 FOUND_FIT = 0.6
 PATIENCE = 3
@@ -40,12 +41,13 @@ class Recovery:
     def judge(
         self, track: TrackResult, last: NDArray[np.float64], relocalise: Callable[[], TrackResult | None]
     ) -> TrackResult:
-        """The result to use for this frame, given the previous pose [4, 4]; ``relocalise`` is asked only in need."""
+        """The result to use for this frame, given the previous pose [4, 4]; ``relocalise`` is asked only in need, and
+        when the map explains the frame worse than is usual: a fast motion may have ended in a wrong place nearby."""
         self.note = ""
         trusted = not self.lost and self._plausible(track, last)
-        if not trusted:
-            found = relocalise()
-            if found is not None and found.fit >= max(FOUND_FIT, FOUND_SHARE * self.usual_fit):
+        if not trusted or track.fit < (DOUBT_SHARE * self.usual_fit or DOUBT_FIT):
+            found, known = relocalise(), track.fit if trusted else 0.0
+            if found is not None and found.fit >= max(FOUND_FIT, FOUND_SHARE * self.usual_fit, known):
                 self.note = "relocalised" if self.lost else "recovered"
                 track, trusted = found, True
         if trusted:

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ecslam.datasets import images
-from ecslam.datasets.images import NO_DEPTH, read_color, read_depth, read_header, to_metres
+from ecslam.datasets.images import NO_DEPTH, fill_pinholes, read_color, read_depth, read_header, to_metres
 from ecslam.types import FrameError
 
 W, H = 40, 30
@@ -210,3 +210,29 @@ def test_metres_are_the_nearest_float_and_zero_only_without_depth(scale: float, 
     assert (metres[none] == 0).all()
     assert (metres[~none] > 0).all()
     np.testing.assert_allclose(metres[~none], raw[~none] / scale, rtol=1e-7)
+
+
+def slope() -> np.ndarray:
+    """A floor that falls away behind a box."""
+    depth = np.repeat(np.linspace(2.0, 2.5, 90, dtype=np.float32)[:, None], 120, 1)
+    depth[30:60, 40:80] = 1.0
+    return depth
+
+
+@pytest.mark.parametrize("sieve", ["random", "grid"])
+def test_pinholes_get_the_depth_around_them_but_none_across_an_edge(sieve: str) -> None:
+    true, seen = slope(), slope()
+    seen[
+        RNG.random(seen.shape) < 0.3 if sieve == "random" else np.add.outer(np.arange(90) % 2, np.arange(120) % 2) > 0
+    ] = 0
+    filled = fill_pinholes(seen)
+    assert filled.dtype == np.float32
+    assert (filled[seen > 0] == seen[seen > 0]).all()
+    assert (filled > 0).mean() > 0.95
+    assert np.abs(filled - true)[filled > 0].max() < 0.01
+
+
+def test_depth_that_is_missing_in_whole_patches_stays_missing() -> None:
+    seen = slope()
+    seen[10:20, 10:90] = seen[:, 100:] = seen[5, 5] = 0
+    assert fill_pinholes(seen) is seen

@@ -70,6 +70,14 @@ def test_lights_off_leaves_the_map_alone_and_on_again_it_goes_on():
 
 
 @pytest.mark.slow
+def test_motion_too_fast_for_the_alignment_is_noticed_and_held():
+    slam = engine()
+    reports = walk(slam, list(range(0, 60, 5)))
+    assert all(r.tracked for r in reports)
+    assert error_cm(slam, 55) < 3
+
+
+@pytest.mark.slow
 def test_darkness_with_depth_is_tracked_by_geometry():
     slam = engine()
     walk(slam, list(range(12)))

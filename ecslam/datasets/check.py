@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..config import Config
 from ..indices import evenly
 from ..types import Frame, FrameError, Intrinsics, Sequence
+from .agreement import odd_truth
 from .prefetch import Prefetch
 from .reading import finite_poses
 from .registry import open_sequence
@@ -115,6 +116,7 @@ def check_sequence(sequence: Sequence | str | Path, samples: int = 40, config: C
             *_odd_camera(sequence.intrinsics),
             *_odd_images(depth, used_m, black, unreadable, len(indices)),
             *_odd_poses(poses),
+            *filter(None, [odd_truth(sequence)]),
         ),
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Frame, InputError, Intrinsics, Mesh
-from .images import read_color, read_depth, to_metres
+from .images import fill_pinholes, read_color, read_depth, to_metres
 from .meshes import load_mesh
 
 
@@ -71,7 +71,8 @@ class FileSequence:
             fixed, fraction, rounded = self._undistortion
             color = cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR)
             raw = cv2.remap(raw, rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-        return Frame(index, float(self.times[index]), color, to_metres(raw, self.depth_scale), self._pose(index))
+        depth = fill_pinholes(to_metres(raw, self.depth_scale))
+        return Frame(index, float(self.times[index]), color, depth, self._pose(index))
 
     def timestamps(self) -> NDArray[np.float64]:
         """[N] seconds."""

@@ -41,7 +41,8 @@ def open(path: Path) -> FileSequence:
     pairs = associate(color_times, depth_times, MAX_DIFFERENCE_S)
     if len(pairs) == 0:
         raise InputError(
-            f"{path}: no colour and depth image lie within 20 ms of each other; do both lists use one clock?"
+            f"{path}: no colour and depth image lie within 20 ms of each other; do both lists count seconds, "
+            "on one clock?"
         )
     color_files, depth_files = [color_files[i] for i in pairs[:, 0]], [depth_files[i] for i in pairs[:, 1]]
     _require(path, [*color_files, *depth_files])

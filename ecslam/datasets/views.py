@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..types import Frame, InputError, Intrinsics, Mesh, Sequence
 
 GAP_S = 1.0
+UNITS = ((5e6, "nanoseconds"), (5e3, "microseconds"), (5.0, "milliseconds"))  # from which median step on, in seconds
 
 
 @dataclass(eq=False)
@@ -108,10 +109,15 @@ def problems(sequence: Sequence) -> list[str]:
     """What is odd about a sequence without reading its images, in plain words: loader's notes, time, missing poses."""
     found = list(getattr(sequence, "notes", ()))
     steps = np.diff(sequence.timestamps())
+    forward = steps[steps > 0]
+    usual = float(np.median(forward)) if len(forward) else 0.0
+    unit = next((unit for least, unit in UNITS if usual >= least), None)
+    if unit is not None:
+        found.append(f"frames seem {usual:.3g} s apart: time stamps are read as seconds, these look like {unit}")
     counts = {
         "frames repeat the time of the one before": int((steps == 0).sum()),
         "frames go backwards in time": int((steps < 0).sum()),
-        f"gaps of more than {GAP_S:g} s between frames": int((steps > GAP_S).sum()),
+        f"gaps of more than {GAP_S:g} s between frames": 0 if unit else int((steps > GAP_S).sum()),
     }
     found += [f"{count} {what}" for what, count in counts.items() if count]
     return found
