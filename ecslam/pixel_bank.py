@@ -38,7 +38,8 @@ class PixelBank:
         return [self._place(view) for view in views]
 
     def _place(self, view: Pixels) -> Place:
-        key = view.depth.__array_interface__["data"][0]  # of memory that is held here, so nothing else comes to lie there
+        # The address of memory that is held here from now on, so nothing else comes to lie there.
+        key = view.depth.__array_interface__["data"][0]
         if key not in self._places:
             first, last = self._used, self._used + len(view)
             self._require(last)
