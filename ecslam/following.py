@@ -74,7 +74,7 @@ class Follower:
             self._observe(trajectory, keyframes)
         surface, tracker = self._tracker(field, config)
         last, gap = trajectory[-1], frame.timestamp - trajectory.timestamps[-1] > GAP_S
-        guess = last if self.recovery.lost or gap else trajectory.predict()
+        guess = last if self.recovery.lost or gap else trajectory.predict(frame.timestamp)
         track = best_start(lambda start: tracker.track(frame, start, field, config), around(guess) if gap else [guess])
         return self.recovery.judge(track, last, lambda: self._find_again(frame, surface, trajectory, keyframes, config))
 

@@ -7,7 +7,9 @@ about a point that it looks at, and v then moves it.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .rigid import inverse, orthonormalise, rotation_angle_deg
@@ -15,6 +17,7 @@ from .rigid import inverse, orthonormalise, rotation_angle_deg
 __all__ = [
     "inverse",
     "orthonormalise",
+    "repeated",
     "retract",
     "rotation_angle_deg",
     "skew",
@@ -77,6 +80,15 @@ def retract(c2w: Tensor, xi: Tensor, about: Tensor | None = None) -> Tensor:
     top = torch.cat([rotation, translation[..., None]], -1)
     bottom = c2w[..., 3:, :].expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], -2)
+
+
+def repeated(motion: NDArray[np.float64], times: float) -> NDArray[np.float64]:
+    """A small rigid motion [4, 4] so many times over, which may be a fraction: rotation and translation apart."""
+    turn = so3_log(torch.from_numpy(motion[:3, :3]))
+    out = motion.copy()
+    out[:3, :3] = so3_exp(times * turn).numpy()
+    out[:3, 3] = times * motion[:3, 3]
+    return out
 
 
 def tangent_gradient(c2w: Tensor, gradient: Tensor, about: Tensor | None = None) -> Tensor:

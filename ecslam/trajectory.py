@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from . import se3
 
 ROOM = 64
+UNEVEN, MOST_STEPS = 0.3, 15.0  # steps of time: less than this from one is jitter; half a second of a usual camera
 
 
 class Trajectory:
@@ -55,11 +56,15 @@ class Trajectory:
         """Poses [N, 4, 4] of all frames."""
         return np.asarray(self._keyframes[self._anchor[: self._count]] @ self._relative[: self._count])
 
-    def predict(self) -> NDArray[np.float64]:
-        """Constant-velocity guess [4, 4] for the next frame."""
+    def predict(self, timestamp: float) -> NDArray[np.float64]:
+        """Constant-velocity guess [4, 4] for a frame at ``timestamp`` seconds, after frames that are missing, too."""
         if len(self) < 2:
             return self[-1]
-        return se3.orthonormalise(self[-1] @ se3.inverse(self[-2]) @ self[-1])
+        motion, (before, last) = se3.inverse(self[-2]) @ self[-1], self.timestamps[-2:]
+        steps = (timestamp - last) / (last - before) if last > before else 1.0
+        if abs(steps - 1) > UNEVEN:
+            motion = se3.repeated(motion, min(max(steps, 0.0), MOST_STEPS))
+        return se3.orthonormalise(self[-1] @ motion)
 
     def state(self) -> dict[str, NDArray[np.generic]]:
         """Everything as arrays, for a checkpoint."""

@@ -1,6 +1,7 @@
 """Frames hang on their keyframes."""
 
 import numpy as np
+import pytest
 import torch
 
 from ecslam import se3
@@ -40,7 +41,29 @@ def test_frames_follow_their_keyframe_rigidly():
 
 
 def test_prediction_is_constant_velocity():
-    assert np.allclose(build().predict(), moved(1.2))
+    t = build()
+    assert np.allclose(t.predict(t.timestamps[-1] * 12 / 11), moved(1.2))
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(1.25, 1), (0.8, 1), (2, 2), (0.5, 0.5), (6, 6), (200, 15), (-3, 0)])
+def test_prediction_counts_on_missing_frames(steps, expected):
+    """Jitter of the time stamps is none of the camera's."""
+    step = se3.retract(
+        torch.eye(4, dtype=torch.float64), torch.tensor([0, 0, 0.01, 0, 0.02, 0], dtype=torch.float64)
+    ).numpy()
+    t = Trajectory()
+    t.append(moved(5), 0.0, keyframe=True)
+    t.append(moved(5) @ step, 1 / 30, keyframe=False)
+    found = se3.inverse(moved(5) @ step) @ t.predict((1 + steps) / 30)
+    turn = torch.tensor([0, 0.02 * expected, 0], dtype=torch.float64)
+    assert np.allclose(found[:3, 3], [0, 0, 0.01 * expected])
+    assert np.allclose(found[:3, :3], se3.so3_exp(turn))
+
+
+def test_prediction_after_frames_at_one_time_goes_on_as_before():
+    t = build()
+    t.append(moved(1.3), t.timestamps[-1], keyframe=False)
+    assert np.allclose(t.predict(t.timestamps[-1] + 1), t[-1] @ se3.inverse(t[-2]) @ t[-1])
 
 
 def test_prediction_goes_on_along_a_curve():
@@ -52,7 +75,7 @@ def test_prediction_goes_on_along_a_curve():
     for i in range(3):
         t.append(pose, i / 30, i == 0)
         pose = pose @ step
-    assert np.allclose(t.predict(), pose)
+    assert np.allclose(t.predict(3 / 30), pose)
 
 
 def test_state_round_trip():
