@@ -5,6 +5,7 @@ import errno
 import io
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -431,6 +432,13 @@ def test_help_names_every_command():
     text = ecslam("--help").out
     for command in ("run", "demo", "resume", "view", "eval", "mesh", "synth", "check", "bench"):
         assert f" {command} " in text
+
+
+@pytest.mark.parametrize("words", [["run"], ["eval"], ["bench", "speed", "--frames"]])
+def test_what_is_missing_is_named(words):
+    outcome = ecslam(*words)
+    assert outcome.code == 2
+    assert re.search("missing argument|requires an argument", outcome.err, re.I), outcome.err
 
 
 def test_a_run_whose_sequence_has_moved_goes_on_where_it_is_now(sequence, tmp_path):

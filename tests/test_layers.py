@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import re
 import subprocess
 import sys
 import zipfile
@@ -12,9 +13,10 @@ import pytest
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    tomllib = pytest.importorskip("tomli")
+    import tomli as tomllib
 
 ROOT = Path(__file__).parent.parent
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 LAYERS = (
     ("types", "messages", "config", "config_files"),
     ("rigid", "indices", "compiled", "atomic"),
@@ -32,6 +34,7 @@ LAYERS = (
     ("commands",),
     ("cli",),
 )
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "tomllib": "tomli", "yaml": "pyyaml"}
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 GROUND = {"types", "messages", "config", "indices", "compiled", "atomic"}
 
@@ -121,7 +124,7 @@ def test_no_two_modules_import_each_other():
 def test_the_command_starts_without_heavy_libraries():
     found = {name.split(".")[0] for name in reached("ecslam.commands")}
     assert {"numpy", "cv2"} <= found
-    assert not found & {"torch", "scipy", "numba", "matplotlib", "trimesh", "skimage", "viser", "ecslam_app"}
+    assert not found & {"torch", "scipy", "numba", "matplotlib", "trimesh", "viser", "ecslam_app"}
 
 
 def test_datasets_import_the_ground_layer_only():
@@ -166,8 +169,34 @@ def test_heavy_libraries_stay_behind_their_seams():
     assert users_of("viser")
 
 
+def third_party(roots: set[str]) -> set[str]:
+    """The distributions that bring these top-level modules, without Python's own and ours."""
+    own = {"ecslam", "ecslam_app", "tests", *(path.stem for path in Path(__file__).parent.glob("*.py"))}
+    return {DISTRIBUTIONS.get(name, name) for name in roots - sys.stdlib_module_names - own}
+
+
+def declared(*extras: str) -> set[str]:
+    """The distributions that pyproject.toml asks for: always, and with these extras."""
+    project = PYPROJECT["project"]
+    asked = sum((project["optional-dependencies"][name] for name in extras), project["dependencies"])
+    return {re.split(r"[^\w-]", requirement)[0] for requirement in asked}
+
+
+def test_pyproject_declares_what_is_imported_and_nothing_else():
+    imported = third_party({name.split(".")[0] for module in MODULES for name in imports(module)})
+    assert declared() <= imported <= declared("oracles", "peer")
+
+
+def test_pyproject_declares_what_tests_import():
+    trees = [ast.parse(path.read_text("utf-8")) for path in Path(__file__).parent.glob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level}
+    assert third_party({name.split(".")[0] for name in names}) <= declared("dev", "oracles")
+
+
 def test_pyproject_lists_every_package():
-    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    listed = set(PYPROJECT["tool"]["setuptools"]["packages"])
     folders = {m for m, path in MODULES.items() if path.name == "__init__.py"}
     assert listed == folders | {"ecslam.configs"}
     assert {p.parent for p in MODULES.values()} == {MODULES[m].parent for m in folders}

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import KDTree
 
 from ecslam.meshing import MeshingStopped, ObservedBlocks, extract_mesh, voxel_for_budget
 from ecslam.meshing_blocks import pack, unpack
@@ -70,6 +71,25 @@ def test_a_box_is_closed_and_has_its_size() -> None:
     assert solid.is_watertight
     assert solid.extents == pytest.approx([0.8] * 3, abs=1e-3)
     assert solid.volume == pytest.approx(0.8**3, rel=0.01)
+
+
+def test_the_surface_is_that_of_another_marching_cubes() -> None:
+    """On one lattice both put their vertices on the same edges; only how they are joined may differ."""
+    measure = pytest.importorskip("skimage.measure")
+    voxel_m, first, count = 0.05, np.array([-8, -18, -14]), 32
+
+    def bumpy_sdf(points: np.ndarray) -> np.ndarray:
+        return sphere_sdf(points) + 0.3 * np.sin(9 * points).prod(1)
+
+    lattice = (first + np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)) * voxel_m
+    values = bumpy_sdf(lattice.astype(np.float32)).reshape(count, count, count)
+    vertices, faces, *_ = measure.marching_cubes(values, 0.0)
+    theirs = trimesh.Trimesh((first + vertices) * voxel_m, faces, process=False)
+    mine = as_trimesh(extract_mesh(bumpy_sdf, None, ObservedBlocks.from_points(lattice, 0.08), voxel_m))
+    for a, b in ((mine, theirs), (theirs, mine)):
+        assert KDTree(a.vertices).query(b.vertices)[0].max() < 1e-4
+    assert mine.area == pytest.approx(theirs.area, rel=5e-3)
+    assert len(mine.vertices) > 1000
 
 
 def test_any_field_gives_a_closed_manifold() -> None:

@@ -88,7 +88,7 @@ def test_a_picture_is_written(tmp_path: Path, case: str) -> None:
     plot_run(tmp_path / "run.png", mesh, estimate, None if case == "no truth" else truth, "A run")
     image = cv2.imread(str(tmp_path / "run.png"))
     assert image is not None
-    assert image.shape == (984, 1920, 3)
+    assert image.shape == (990, 1920, 3)
     left = image[130:, :1250].astype(int)
     green = (left[..., 1] > 1.5 * left[..., 0]) & (left[..., 1] > 1.5 * left[..., 2])
     assert (green.mean() > 0.05) == (case != "no mesh")

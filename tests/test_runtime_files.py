@@ -12,6 +12,7 @@ import pytest
 import trimesh
 
 from ecslam.atomic import write_atomic
+from ecslam.datasets.meshes import NoSurface, load_mesh
 from ecslam.messages import Notice
 from ecslam.runtime import files
 from ecslam.runtime.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -196,6 +197,13 @@ def test_trimesh_reads_back_geometry_and_vertex_colours(tmp_path, form):
     assert np.array_equal(back.faces, mesh.faces)
     assert np.array_equal(back.visual.vertex_colors[:, :3], mesh.colors)
     assert back.volume == pytest.approx(1 / 6)
+
+
+@pytest.mark.parametrize("points", [0, 3])
+def test_points_without_triangles_are_no_surface(tmp_path, points):
+    (tmp_path / "m.ply").write_bytes(mesh_bytes(Mesh(np.eye(3)[:points], np.zeros((0, 3), np.int32)), "ply"))
+    with pytest.raises(NoSurface, match="without triangles"):
+        load_mesh(tmp_path / "m.ply")
 
 
 def test_ply_without_colours_and_without_triangles(tmp_path):

@@ -27,7 +27,7 @@ def load_mesh(path: Path, mend: str = "replace it") -> Mesh:
         mesh: Any = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh raises whatever its many readers do
         raise InputError(f"{path}: not a readable mesh ({' '.join(str(error).split())}); {mend}") from None
-    if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
+    if len(getattr(mesh, "faces", ())) == 0 or len(mesh.vertices) == 0:  # older trimeshes: a list, a PointCloud
         raise NoSurface(f"{path}: a mesh without triangles; {mend}")
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{path}: not a readable mesh (vertices that are not finite); {mend}")

@@ -36,7 +36,7 @@ def plot_run(
     finite = poses_est[np.isfinite(poses_est).all((1, 2))]
     up = up_direction(finite)
     error = None if poses_gt is None else absolute_error(poses_est, poses_gt)
-    figure = Figure(figsize=(16, 8.2), facecolor="white", dpi=DPI)
+    figure = Figure(figsize=(16, 8.25), facecolor="white", dpi=DPI)
     figure.text(0.025, 0.945, title, size=20, weight="bold", color=INK, va="center")
     figure.text(0.025, 0.895, _summary(mesh, poses_est, error), size=12, color=MUTED, va="center")
     _draw_map(figure, mesh, finite, up)
