@@ -75,7 +75,7 @@ def choose(
     cells = _cells(frame, len(jitter) if config.fus else 1, config)
     found = tracking_gpu.chosen(
         frame.color, frame.depth, jitter, corners, order if config.fus else None, cells, _lens(camera, config),
-        Marks(observed.marks.view(torch.uint8), len(observed.marks), VOXEL_M), c2w, LEAST_KNOWN,
+        Marks(observed.marks.view(torch.uint8), len(observed.marks), 1 / VOXEL_M), c2w, LEAST_KNOWN,
     )  # fmt: skip
     return DevicePixels(found.direction, found.depth, found.color, found.feature.view(torch.bool))
 

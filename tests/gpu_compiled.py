@@ -77,7 +77,7 @@ def launch_the_volume():
     spread = tracking_gpu.spread(color, depth, torch.zeros(3000, 2), cells, lens, luminance)
     _, row = tracking_gpu.packed(blocks, spread, pose, 100)
     tracking_gpu.told(blocks, spread, pose, row, 0.03, 0.1)
-    marks = tracking_gpu.Marks(torch.zeros(1 << 12, dtype=torch.uint8), 1 << 12, 0.05)
+    marks = tracking_gpu.Marks(torch.zeros(1 << 12, dtype=torch.uint8), 1 << 12, 20.0)
     for order in (torch.zeros(3000, dtype=torch.int64), None):
         given = torch.zeros(1000, 3), torch.zeros(200, dtype=torch.int64), order, cells, lens, marks, pose, 100
         tracking_gpu.chosen(color, depth, *given)

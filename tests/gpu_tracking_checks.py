@@ -175,7 +175,7 @@ def test_voxels_are_hashed_as_they_are_marked():
     table.add(np.stack([u * depth[0, u], 0 * u, depth[0, u]], 1).astype(np.float32), shift)
     jitter = torch.stack([torch.zeros(64), (torch.arange(64) + 0.5) / 64, torch.zeros(64)], 1).to(DEVICE)
     none, least = torch.zeros(0, dtype=torch.int64, device=DEVICE), LEAST_KNOWN
-    marks = tracking_gpu.Marks(table.marks.view(torch.uint8), len(table.marks), VOXEL_M)
+    marks = tracking_gpu.Marks(table.marks.view(torch.uint8), len(table.marks), 1 / VOXEL_M)
     cells = tracking_gpu.Cells(64, 0, 1, 0, 63, 1.0, 64.0)
     lens = tracking_gpu.Lens(camera.fx, camera.fy, camera.cx, camera.cy, config.depth_near_m, config.depth_far_m)
     there = torch.from_numpy(shift).to(DEVICE)

@@ -33,12 +33,12 @@ class Cells(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """Where the map has been observed. marks: uint8 [slots], 1 at the hashes of observed voxels, ``voxel`` metres wide.
-    slots: a power of two."""
+    """Where the map has been observed. marks: uint8 [slots], 1 at the hashes of observed voxels. slots: a power of two.
+    per_metre: voxels in a metre; the processor divides float64 by calling a function, so it multiplies."""
 
     marks: Tensor
     slots: int
-    voxel: float
+    per_metre: float
 
 
 class Lens(NamedTuple):
@@ -149,8 +149,8 @@ def told_kernel(points, distance, c2w, cost, count, told, total, near, least_see
 @triton.jit
 def is_observed(observed, x, y, z):
     """Whether world points (float64 metres) lie in a marked voxel."""
-    kx, ky = tl.floor(x / observed.voxel).to(tl.int64), tl.floor(y / observed.voxel).to(tl.int64)
-    kz = tl.floor(z / observed.voxel).to(tl.int64)
+    kx, ky = tl.floor(x * observed.per_metre).to(tl.int64), tl.floor(y * observed.per_metre).to(tl.int64)
+    kz = tl.floor(z * observed.per_metre).to(tl.int64)
     return tl.load(observed.marks + ((kx ^ (ky * SECOND) ^ (kz * THIRD)) & (observed.slots - 1))) != 0
 
 
