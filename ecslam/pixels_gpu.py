@@ -45,9 +45,7 @@ def padded_corners(frame: Frame, config: Config, count: int) -> NDArray[np.int64
 
 def grid_cells(frame: DeviceFrame, count: int, config: Config) -> int:
     """How many cells a grid of ``count`` pixels has: as many, or the few more that rows and columns need."""
-    height, width = frame.depth.shape
-    border = border_of(config, height, width)
-    rows, columns = grid_shape(height - 2 * border, width - 2 * border, count)
+    _, rows, columns = _grid(frame, count, config)
     return rows * columns
 
 
@@ -85,8 +83,13 @@ def _lens(camera: Intrinsics, config: Config) -> Lens:
 
 
 def _cells(frame: DeviceFrame, count: int, config: Config) -> Cells:
+    border, rows, columns = _grid(frame, count, config)
+    h, w = (side - 2 * border for side in frame.depth.shape)
+    return Cells(frame.depth.shape[1], border, columns, h - 1, w - 1, h / rows, w / columns)
+
+
+def _grid(frame: DeviceFrame, count: int, config: Config) -> tuple[int, int, int]:
+    """The border of the frame's image, and rows and columns of the grid of ``count`` cells inside it."""
     height, width = frame.depth.shape
     border = border_of(config, height, width)
-    h, w = height - 2 * border, width - 2 * border
-    rows, columns = grid_shape(h, w, count)
-    return Cells(width, border, columns, h - 1, w - 1, h / rows, w / columns)
+    return border, *grid_shape(height - 2 * border, width - 2 * border, count)
