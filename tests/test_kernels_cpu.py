@@ -92,6 +92,13 @@ def test_step_after_the_box_grew(log2_table_size):
     assert_step(field, *make_rays(100, 20))
 
 
+def test_step_when_many_neighbours_in_a_cell_have_no_gradient():
+    c2w, rays = make_rays(70, 40)
+    rays = replace(rays, depth=torch.full((70,), 0.7), z=torch.linspace(0.67, 0.9, 40).repeat(70, 1))
+    weights = replace(WEIGHTS, depth_uniform=0.0, depth_feature=0.0, colour_uniform=0.0, colour_feature=0.0)
+    assert_step(make_field(), c2w, rays, weights=weights)
+
+
 @pytest.mark.parametrize("feature", [True, False])
 @pytest.mark.parametrize("depth", [True, False])
 def test_step_when_all_rays_are_alike(feature, depth):

@@ -184,12 +184,12 @@ def table_back(grid, level, x, d_enc, n, pitch, rows, parts, d_table):
             if live and not (same >> i) & 1:
                 scatter_add(d_table, rows, run, sum_a, sum_b)
                 live = False
+            run = own + 8 * i
             a, b = d_enc[at_a + p + i], d_enc[at_b + p + i]
             if a == 0 and b == 0:
                 continue
             if not live:
                 live, sum_a, sum_b = True, zero, zero
-            run = own + 8 * i
             w = (bx + ux * splat(parts[i])) * (by + uy * splat(parts[8 + i])) * (bz + uz * splat(parts[16 + i]))
             sum_a, sum_b = sum_a + w * splat(a), sum_b + w * splat(b)
     if live:
