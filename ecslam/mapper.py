@@ -17,7 +17,7 @@ from .field import TsdfField, grow_field, map_params, regrow
 from .field_adam import FieldAdam
 from .kernels import LOSS_NAMES, Backend, FieldParams, RayBatch, Weights
 from .kernels.graphs import Recorder
-from .losses import smooth_lattice, smoothness_gradient
+from .losses import smooth_lattice
 from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
@@ -188,7 +188,8 @@ class Mapper:
             rays, now = draw(iteration, poses.c2w), poses.c2w.float()
             result = self.kernels.step(field.layout, field.params, now, rays, job.weights, self._gradients, job.move)
             if job.smooth and m.smooth_weight > 0:
-                gradient = smoothness_gradient(field, smooth_lattice(field, m, self._generator))
+                lattice = smooth_lattice(field, m, self._generator)
+                gradient = self.kernels.smoothness(field.layout, field.params.table, lattice)
                 self._gradients.table.add_(gradient, alpha=m.smooth_weight)
             self._optimiser.step(_tensors(self._gradients), job.map_rates(share))
             field.params.beta.clamp_(min=MIN_BETA)

@@ -18,9 +18,10 @@ from kernel_cases import (
     relative_rms,
 )
 
-from ecslam.config import FieldConfig
+from ecslam.config import FieldConfig, MappingConfig
 from ecslam.field import grow_field, map_params
 from ecslam.kernels import FieldParams, reference
+from ecslam.losses import smooth_lattice
 from ecslam.pose_adam import PoseAdam
 
 cpu = pytest.importorskip("ecslam.kernels.cpu")
@@ -239,3 +240,16 @@ def test_steps_of_the_poses(poses, about):
         theirs.step(gradient, share)
         torch.testing.assert_close(mine.c2w, theirs.c2w, rtol=0, atol=1e-12)
     assert poses < 5 or (mine.c2w - c2w).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+@pytest.mark.parametrize(("side", "step_m"), [(2, 0.1), (5, 0.03), (9, 0.1), (16, 0.5)])
+def test_smoothness_agrees_with_the_reference(kind, side, step_m):
+    field = make_field(FIELDS[kind])
+    config = MappingConfig(smooth_points=side, smooth_voxel_m=step_m)
+    lattice = smooth_lattice(field, config, torch.Generator().manual_seed(side))
+    found = cpu.smoothness(field.layout, field.params.table, lattice)
+    expected = reference.smoothness(field.layout, field.params.table.double(), lattice.double())
+    assert expected.abs().max() > 0
+    assert relative_rms(found, expected) < CLOSE
+    assert torch.equal(found, cpu.smoothness(field.layout, field.params.table, lattice))

@@ -1,4 +1,4 @@
-"""The kernel seam: six functions, one signature, three back ends.
+"""The kernel seam: seven functions, one signature, three back ends.
 
 ``reference`` (torch, readable, any device), ``cpu`` (numba) and ``gpu`` (Triton). The device picks the back end;
 ``ECSLAM_KERNELS=reference`` or ``with kernels.use("reference")`` overrides. An explicit choice that cannot run raises
@@ -97,6 +97,10 @@ class Backend(Protocol):
 
     def pose_step(self, c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, count: int) -> Tensor:
         """Poses [P, 4, 4] after one step of Adam."""
+        ...
+
+    def smoothness(self, layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:
+        """Gradient [rows, 2] of the smoothness term on a lattice of points [n^3, 3]."""
         ...
 
 

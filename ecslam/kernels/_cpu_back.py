@@ -157,8 +157,9 @@ def add_sums(target, at, sums):
 
 
 @njit(**INNER)
-def table_back(grid, level, x, d_enc, n, pitch, rows, parts, d_table):
-    """Add one level's rows of the table gradient from a chunk of points: x [6, pitch], d_enc [padded, pitch].
+def table_back(grid, level, x, d_enc, at_a, n, pitch, rows, parts, d_table):
+    """Add one level's rows of the table gradient from a chunk of points: x [6, pitch], d_enc [features, pitch], the
+    level's two from ``at_a`` on.
 
     Neighbours on a ray often share a cell: their sums stay in registers, one lane per corner, until the cell changes.
     rows: int32 [3, 64] and parts: float32 [24] are scratch.
@@ -169,7 +170,7 @@ def table_back(grid, level, x, d_enc, n, pitch, rows, parts, d_table):
     last_x, last_y, last_z = isplat(-(2**31)), isplat(-(2**31)), isplat(-(2**31))
     sum_a, sum_b = zero, zero
     run, live = 0, False
-    at_a, at_b = 2 * level * pitch, (2 * level + 1) * pitch
+    at_b = at_a + pitch
     for p in range(0, n, 8):
         ix, iy, iz, fx, fy, fz = locate(grid, level, x, p, pitch)
         corners(grid.levels, level, ix, iy, iz, rows)

@@ -269,7 +269,8 @@ def table_worker(t, counter, kept, chunk_rays, grid, padded, total, samples, d_t
         d_table[start : start + 2 * grid.levels[level, MASK] + 2] = 0
         for chunk in range(chunks):
             n = up_to_eight(min(chunk_rays, total - chunk * chunk_rays) * samples)
-            table_back(grid, level, kept[chunk, : 6 * pitch], kept[chunk, 6 * pitch :], n, pitch, rows, parts, d_table)
+            x, d_enc = kept[chunk, : 6 * pitch], kept[chunk, 6 * pitch :]
+            table_back(grid, level, x, d_enc, 2 * level * pitch, n, pitch, rows, parts, d_table)
 
 
 @njit(**OUTER)

@@ -26,6 +26,7 @@ from ._cpu_field import Grid, Net, scratch_floats
 from ._cpu_math import BOTH, HALF
 from ._cpu_poses import pose_worker
 from ._cpu_rays import Rays, count_rays, pose_gradients
+from ._cpu_smooth import from_anchor, smooth_worker
 from ._cpu_work import (
     add_partials,
     align_worker,
@@ -264,3 +265,15 @@ def pose_step(c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, c
     state = moments.mean.numpy(), moments.square.numpy(), rates.contiguous().numpy()
     pose_worker(poses, pulls, *state, about, moments.decays, moments.epsilon, count, moved.numpy())
     return moved
+
+
+def smoothness(layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:
+    """See ``reference.smoothness``."""
+    n = (len(lattice) + 7) // 8 * 8
+    grid, gradient, threads = _grid(layout), torch.empty_like(table), torch.get_num_threads()
+    x, scratch = _workspace.array("lattice", 6 * n), _workspace.array("lattice_features", threads, 4 * n)
+    from_anchor(grid, _array(lattice), x)
+    side = round(len(lattice) ** (1 / 3))
+    flat = (_array(table).reshape(-1), x, side, gradient.numpy().reshape(-1))
+    _spread(threads, smooth_worker, scratch, grid, *flat)
+    return gradient

@@ -29,6 +29,7 @@ from ._gpu_field import Field, Shape
 from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, place_kernel, values_kernel, weights_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
 from .poses_gpu import pose_step as pose_step
+from .reference import smoothness as smoothness
 
 VALUES_BLOCK, VALUES_WARPS = 64, 4  # sixteen points a warp, which one instruction of a tensor core takes
 VALUES_REGISTERS = 168  # a thread; so that three programs share a processor

@@ -231,3 +231,26 @@ def pose_step(c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, c
     square.mul_(decays[1]).addcmul_(gradient, gradient, value=1 - decays[1])
     first, second = mean / (1 - decays[0] ** count), square / (1 - decays[1] ** count)
     return se3.retract(c2w, -rates * first / (second.sqrt() + moments.epsilon), moments.about)
+
+
+def smoothness(layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:
+    """Gradient [rows, 2] by the table of the mean squared difference of hash features between neighbours in a lattice
+    [n^3, 3] of points inside the box (Co-SLAM, equation 9). Without autograd, whose graph would take gigabytes."""
+    n = round(len(lattice) ** (1 / 3))
+    corners = torch.tensor(CORNERS, device=table.device)
+    gradient = torch.zeros_like(table)
+    for level in range(layout.levels):
+        p = (lattice - layout.anchor.to(lattice)) / layout.voxel[level].to(lattice)
+        cell = p.floor()
+        f = (p - cell)[:, None]
+        weight = torch.where(corners.bool(), f, 1 - f).prod(-1)  # [n^3, 8]
+        rows = row(layout, level, cell.long()[:, None] + corners)
+        feature = (weight[..., None] * table[rows]).sum(1).reshape(n, n, n, -1)
+        d_feature = torch.zeros_like(feature)
+        for axis in range(3):
+            d = torch.diff(feature, dim=axis)
+            d_feature.narrow(axis, 1, n - 1).add_(d, alpha=2 / n**3)
+            d_feature.narrow(axis, 0, n - 1).sub_(d, alpha=2 / n**3)
+        spread = weight[..., None] * d_feature.reshape(-1, 1, feature.shape[-1])
+        gradient.index_add_(0, rows.reshape(-1), spread.reshape(-1, feature.shape[-1]))
+    return gradient

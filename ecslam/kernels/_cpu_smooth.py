@@ -1,0 +1,69 @@
+"""The smoothness term's gradient, jitted: a level belongs to one thread at a time, so nothing is atomic."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from ._cpu_back import table_back
+from ._cpu_field import ANCHOR, MASK, OFFSET, corners, locate, mix
+from ._cpu_math import INNER, OUTER
+from ._cpu_simd import fetch_add, store
+from ._cpu_table import gather
+
+
+@njit(**INNER)
+def level_features(grid, level, table, x, n, rows, feature):
+    """Both features [2 n] of one level at points x [6, n]; n is a multiple of 8."""
+    for p in range(0, n, 8):
+        ix, iy, iz, fx, fy, fz = locate(grid, level, x, p, n)
+        corners(grid.levels, level, ix, iy, iz, rows)
+        a, b, c, d = gather(table, rows, 0), gather(table, rows, 8), gather(table, rows, 16), gather(table, rows, 24)
+        e, f, g, h = gather(table, rows, 32), gather(table, rows, 40), gather(table, rows, 48), gather(table, rows, 56)
+        for k in range(2):
+            v = mix((a[k], b[k], c[k], d[k], e[k], f[k], g[k], h[k]), fx, fy, fz)
+            store(feature, k * n + p, v[0])
+
+
+@njit(**INNER)
+def differences_back(feature, side, start, d_feature):
+    """Gradient of the mean squared difference of neighbours in a lattice [side]^3 that begins at ``start``."""
+    scale = np.float32(2 / side**3)
+    for axis in range(3):
+        stride = side ** (2 - axis)
+        for block in range(0, side**3, stride * side):
+            for i in range(start + block, start + block + stride * (side - 1)):
+                d = scale * (feature[i + stride] - feature[i])
+                d_feature[i + stride] += d
+                d_feature[i] -= d
+
+
+@njit(**OUTER)
+def from_anchor(grid, points, x):
+    """Points [N, 3] from the anchor on: rounded, and what rounding lost, in x [6, n >= N]."""
+    n = x.shape[0] // 6
+    x[:] = 0
+    for axis in range(3):
+        for i in range(points.shape[0]):
+            exact = np.float64(points[i, axis]) - grid.geometry[ANCHOR + axis]
+            x[axis * n + i] = exact
+            x[(3 + axis) * n + i] = exact - np.float64(x[axis * n + i])
+
+
+@njit(**OUTER)
+def smooth_worker(t, counter, scratch, grid, table, x, side, d_table):
+    """Gradient of the whole table; scratch: float32 [threads, 4 n]."""
+    n, levels = x.shape[0] // 6, grid.levels.shape[0]
+    feature, d_feature = scratch[t, : 2 * n], scratch[t, 2 * n :]
+    rows, parts = np.empty(192, np.int32), np.empty(24, np.float32)
+    while True:
+        level = levels - 1 - fetch_add(counter, 0)
+        if level < 0:
+            break
+        start = 2 * grid.levels[level, OFFSET]
+        d_table[start : start + 2 * grid.levels[level, MASK] + 2] = 0
+        level_features(grid, level, table, x, n, rows, feature)
+        d_feature[:] = 0
+        for k in range(2):
+            differences_back(feature, side, k * n, d_feature)
+        table_back(grid, level, x, d_feature, 0, n, n, rows, parts, d_table)
