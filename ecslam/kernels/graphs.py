@@ -7,6 +7,7 @@ host, and must take the same way whatever the values.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
@@ -15,6 +16,8 @@ from torch import Tensor
 
 Tensors = tuple[Tensor, ...]
 Capture = Callable[[Callable[[], Tensors], torch.device], tuple[Callable[[], None], Tensors]]
+
+_recording = threading.Lock()  # torch has one stream to record in, whichever thread asks
 
 
 @dataclass
@@ -32,7 +35,7 @@ def capture_cuda(function: Callable[[], Tensors], device: torch.device) -> tuple
 
     Only this thread's calls count as forbidden ones: tracking and mapping may use the device at the same time.
     """
-    with torch.cuda.device(device):
+    with _recording, torch.cuda.device(device):
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             outputs = function()
