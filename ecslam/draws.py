@@ -57,9 +57,11 @@ class HostDraw:
         missing = torch.nonzero(rays.depth <= 0)[:, 0]
         if not len(missing):
             return rays
-        few = make_rays(pixels.take(missing), rays.pose[missing], c2w, self._box, self._config, jitter[missing], True)
+        row, numbers = rays.pose.index_select(0, missing), jitter.index_select(0, missing)
+        few = make_rays(pixels.take(missing), row, c2w, self._box, self._config, numbers, missing=True)
         z = resampled(few, c2w, self._field, self._kernels, self._config.sampling, self._generator)
-        return replace(rays, z=rays.z.index_copy(0, missing, z))
+        rays.z.index_copy_(0, missing, z)
+        return rays
 
     def _some(self, c2w: Tensor) -> list[tuple[DevicePixels, Tensor, RayBatch]]:
         """Pixels, random numbers in 0..1 [R, S] and rays of iterations; z of rays without depth is yet to be found."""

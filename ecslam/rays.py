@@ -12,6 +12,7 @@ from torch import Tensor
 
 from .config import Config, LossWeights
 from .kernels import RayBatch, Weights
+from .kernels.types import taken
 from .pixels import Pixels
 from .samples import ray_exit, sample_depths
 
@@ -28,13 +29,13 @@ class DevicePixels:
 
     def take(self, index: Tensor | slice) -> DevicePixels:
         """The pixels at ``index``."""
-        return DevicePixels(*(getattr(self, f.name)[index] for f in fields(self)))
+        return DevicePixels(*(taken(getattr(self, f.name), index) for f in fields(self)))
 
 
 def upload(pixels: Pixels, device: torch.device) -> DevicePixels:
     """The same pixels on ``device``."""
     return DevicePixels(
-        torch.nn.functional.pad(torch.from_numpy(pixels.direction).to(device), (0, 1), value=1.0),
+        torch.from_numpy(np.pad(pixels.direction, ((0, 0), (0, 1)), constant_values=1)).to(device),
         torch.from_numpy(pixels.depth).to(device),
         torch.from_numpy(pixels.color).to(device),
         torch.from_numpy(pixels.feature).to(device),
@@ -60,17 +61,22 @@ def make_rays(
     """
     far = torch.full_like(pixels.depth, config.depth_far_m)
     if missing:
-        poses = c2w.to(far)[row]
+        poses = c2w.to(far).index_select(0, row)
         world = (poses[:, :3, :3] @ pixels.direction[:, :, None])[:, :, 0]
         far = ray_exit(poses[:, :3, 3], world, box, config.depth_far_m)
     return RayBatch(
         direction=pixels.direction,
         z=sample_depths(pixels.depth, far, config.sampling, jitter),
         depth=pixels.depth,
-        color=pixels.color.float() / 255,
+        color=_shares(pixels.color),
         feature=pixels.feature,
         pose=row,
     )
+
+
+def _shares(color: Tensor) -> Tensor:
+    """uint8 as float32 in 0..1. numpy does it alone, torch wakes its threads, which a busy CPU keeps it waiting for."""
+    return torch.from_numpy(color.numpy() / np.float32(255)) if color.device.type == "cpu" else color.float() / 255
 
 
 def view_centre(rays: RayBatch) -> Tensor:

@@ -90,7 +90,8 @@ def follow_plain(z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
 
 def thinned(z: Tensor, config: SamplingConfig) -> Tensor:
     """``uniform`` of the depths [R, S] of each ray, which the others are to follow."""
-    return z[:, (torch.arange(config.uniform, device=z.device) * (z.shape[1] / config.uniform)).long()].contiguous()
+    keep = (torch.arange(config.uniform, device=z.device) * (z.shape[1] / config.uniform)).long()
+    return z.index_select(1, keep)
 
 
 def rendered_depths(rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, jitter: Tensor) -> Tensor:
@@ -112,11 +113,10 @@ def resampled(
 
 def resample_missing(
     rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, config: SamplingConfig, generator: torch.Generator
-) -> RayBatch:
-    """The rays, of which those without depth are ``resampled``. Waits for the device."""
+) -> None:
+    """Those of the rays that have no depth are ``resampled``, in place. Waits for the device."""
     missing = torch.nonzero(rays.depth <= 0)[:, 0]
-    few = resampled(rays.take(missing), c2w, field, kernels, config, generator)
-    return replace(rays, z=rays.z.index_copy(0, missing, few))
+    rays.z.index_copy_(0, missing, resampled(rays.take(missing), c2w, field, kernels, config, generator))
 
 
 def seeded(rng: np.random.Generator, device: torch.device) -> torch.Generator:
