@@ -13,10 +13,10 @@ from torch import Tensor
 from .config import Config
 from .field import TsdfField
 from .indices import evenly
-from .kernels import Backend, RayBatch
+from .kernels import Backend, DevicePixels, RayBatch
 from .pixel_bank import PixelBank
 from .pixels import Pixels
-from .rays import DevicePixels, gather, make_rays, upload
+from .rays import gather, make_rays, upload
 from .samples import LEAST_UNIFORM, rendered_depths, resampled, thinned, uniform
 
 Draw = Callable[[int, Tensor], RayBatch]

@@ -15,13 +15,13 @@ from .config import Config
 from .draws import DeviceDraw, DeviceViews, Draw, HostDraw, device_views, padded
 from .field import TsdfField, grow_field, map_params, regrow
 from .field_adam import FieldAdam
-from .kernels import LOSS_NAMES, Backend, FieldParams, Weights
+from .kernels import LOSS_NAMES, Backend, DevicePixels, FieldParams, Weights
 from .kernels.graphs import Recorder
 from .losses import smooth_lattice, smoothness_gradient
 from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
-from .rays import DevicePixels, kernel_weights
+from .rays import kernel_weights
 from .samples import seeded, uniform
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -11,25 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config, LossWeights
-from .kernels import RayBatch, Weights
-from .kernels.types import taken
+from .kernels import DevicePixels, RayBatch, Weights
 from .pixels import Pixels
 from .samples import ray_exit, sample_depths
-
-
-@dataclass(frozen=True)
-class DevicePixels:
-    """``Pixels`` as tensors on one device. direction: float32 [N, 3], z = 1. depth: float32 [N]. color: uint8 [N, 3].
-    feature: bool [N]."""
-
-    direction: Tensor
-    depth: Tensor
-    color: Tensor
-    feature: Tensor
-
-    def take(self, index: Tensor | slice) -> DevicePixels:
-        """The pixels at ``index``."""
-        return DevicePixels(*(taken(getattr(self, f.name), index) for f in fields(self)))
 
 
 def upload(pixels: Pixels, device: torch.device) -> DevicePixels:
