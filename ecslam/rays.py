@@ -52,13 +52,13 @@ def make_rays(
         direction=pixels.direction,
         z=sample_depths(pixels.depth, far, config.sampling, jitter),
         depth=pixels.depth,
-        color=_shares(pixels.color),
+        color=_fractions(pixels.color),
         feature=pixels.feature,
         pose=row,
     )
 
 
-def _shares(color: Tensor) -> Tensor:
+def _fractions(color: Tensor) -> Tensor:
     """uint8 as float32 in 0..1. numpy does it alone, torch wakes its threads, which a busy CPU keeps it waiting for."""
     return torch.from_numpy(color.numpy() / np.float32(255)) if color.device.type == "cpu" else color.float() / 255
 
