@@ -13,11 +13,11 @@ from torch import Tensor
 from .config import Config
 from .field import TsdfField
 from .indices import evenly
-from .kernels import Backend, RayBatch
+from .kernels import Backend, DevicePixels, RayBatch
 from .pixel_bank import PixelBank
 from .pixels import Pixels
-from .rays import DevicePixels, gather, make_rays, upload
-from .samples import LEAST_UNIFORM, rendered_depths, resample_missing, uniform
+from .rays import gather, make_rays, upload
+from .samples import LEAST_UNIFORM, rendered_depths, resampled, thinned, uniform
 
 Draw = Callable[[int, Tensor], RayBatch]
 AHEAD = 10
@@ -32,8 +32,8 @@ def shares(views: int, rays: int, newest_share: float) -> list[int]:
 
 
 class HostDraw:
-    """Rays for (iteration, poses [W, 4, 4]), on the CPU: ``AHEAD`` iterations' worth at a time, since one takes next to
-    nothing but the calls."""
+    """Rays for (iteration, poses float32 [W, 4, 4]), on the CPU: ``AHEAD`` iterations' worth at a time, since one takes
+    next to nothing but the calls."""
 
     def __init__(
         self,
@@ -57,9 +57,11 @@ class HostDraw:
         missing = torch.nonzero(rays.depth <= 0)[:, 0]
         if not len(missing):
             return rays
-        few = make_rays(pixels.take(missing), rays.pose[missing], c2w, self._box, self._config, jitter[missing], True)
-        few = resample_missing(few, c2w.float(), self._field, self._kernels, self._config.sampling, self._generator)
-        return replace(rays, z=rays.z.index_copy(0, missing, few.z))
+        row, numbers = rays.pose.index_select(0, missing), jitter.index_select(0, missing)
+        few = make_rays(pixels.take(missing), row, c2w, self._box, self._config, numbers, missing=True)
+        z = resampled(few, c2w, self._field, self._kernels, self._config.sampling, self._generator)
+        rays.z.index_copy_(0, missing, z)
+        return rays
 
     def _some(self, c2w: Tensor) -> list[tuple[DevicePixels, Tensor, RayBatch]]:
         """Pixels, random numbers in 0..1 [R, S] and rays of iterations; z of rays without depth is yet to be found."""
@@ -74,7 +76,7 @@ class HostDraw:
 
 
 @dataclass(frozen=True)
-class DeviceDraw:
+class DeviceViews:
     """What the rays of a loop are drawn from, on one device.
 
     spans: int64 [W, 2], first row and count of each view in ``pixels``. row: int64 [R], the view of each ray. box: [2,
@@ -93,35 +95,54 @@ class DeviceDraw:
         s = config.sampling
         return 1 + s.uniform + (2 if self.missing else 1) * s.near_depth
 
-    def rays(self, jitter: Tensor, c2w: Tensor, config: Config, field: TsdfField, kernels: Backend) -> RayBatch:
-        """The rays of an iteration with poses c2w [W, 4, 4], never waiting for the device. jitter: [R, numbers]."""
-        s = config.sampling
-        count = s.uniform + s.near_depth
-        first, length = self.spans[self.row].unbind(1)
-        at = first + torch.minimum((jitter[:, 0] * length).long(), length - 1)
-        pixels = self.pixels.take(at)
-        rays = make_rays(pixels, self.row, c2w, self.box, config, jitter[:, 1 : 1 + count], self.missing)
-        if not self.missing or s.uniform < LEAST_UNIFORM:
+
+class DeviceDraw:
+    """Rays for (iteration, poses float32 [W, 4, 4]), on any device, never waiting for it: those of all iterations at
+    once. What an iteration does itself is to find the map's surface for rays without depth.
+
+    jitter: [I, R, numbers] in 0..1. c2w: [W, 4, 4], the poses that say where rays without depth leave the box.
+    """
+
+    def __init__(
+        self, views: DeviceViews, jitter: Tensor, c2w: Tensor, config: Config, field: TsdfField, kernels: Backend
+    ) -> None:
+        s, (iterations, self._size, _) = config.sampling, jitter.shape
+        count, numbers, row = 1 + s.uniform + s.near_depth, jitter.flatten(0, 1), views.row.repeat(iterations)
+        first, length = views.spans[row].unbind(1)
+        pixels = views.pixels.take(first + torch.minimum((numbers[:, 0] * length).long(), length - 1))
+        self._field, self._kernels = field, kernels
+        self._rays = make_rays(pixels, row, c2w, views.box, config, numbers[:, 1:count], views.missing)
+        self._follow = views.missing and s.uniform >= LEAST_UNIFORM
+        if self._follow:
+            self._thinned, self._jitter = thinned(self._rays.z, s), numbers[:, count:].contiguous()
+            self._has = self._rays.depth[:, None] > 0
+
+    def __call__(self, iteration: int, c2w: Tensor) -> RayBatch:
+        """The rays of an iteration."""
+        part = slice(iteration * self._size, (iteration + 1) * self._size)
+        rays = self._rays.take(part)
+        if not self._follow:
             return rays
-        z = rendered_depths(rays, c2w.float(), field, kernels, s, jitter[:, 1 + count :])
-        return replace(rays, z=torch.where(rays.depth[:, None] > 0, rays.z, z))
+        few = replace(rays, z=self._thinned[part])
+        z = rendered_depths(few, c2w, self._field, self._kernels, self._jitter[part])
+        return replace(rays, z=torch.where(self._has[part], rays.z, z))
 
 
-def device_draw(
+def device_views(
     bank: PixelBank,
     views: Sequence[Pixels],
     poses: int,
     config: Config,
     box: Tensor,
     device: torch.device,
-) -> DeviceDraw:
+) -> DeviceViews:
     """What to draw from these views. Sizes are always the same, so that a graph can be replayed: exactly ``rays`` rays,
     and room for so many ``poses``."""
     m, places = config.mapping, bank.places(views)
     spans = np.zeros((poses, 2), np.int64)
     spans[: len(views)] = [(place.first, len(place.view)) for place in places]
     row = np.repeat(np.arange(len(views)), shares(len(views), m.rays, m.newest_share))
-    return DeviceDraw(
+    return DeviceViews(
         bank.columns,
         torch.from_numpy(spans).to(device),
         torch.from_numpy(row[evenly(len(row), m.rays)]).to(device),

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config
-from .draws import DeviceDraw, Draw, HostDraw, device_draw, padded
+from .draws import DeviceDraw, DeviceViews, Draw, HostDraw, device_views, padded
 from .field import TsdfField, grow_field, map_params, regrow
 from .field_adam import FieldAdam
-from .kernels import LOSS_NAMES, Backend, FieldParams, RayBatch, Weights
+from .kernels import LOSS_NAMES, Backend, DevicePixels, FieldParams, Weights
 from .kernels.graphs import Recorder
 from .losses import smooth_lattice
 from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
-from .rays import DevicePixels, kernel_weights
+from .rays import kernel_weights
 from .samples import seeded, uniform
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 
@@ -135,7 +135,7 @@ class Mapper:
         still[: len(views)] |= fixed
         poses, rates = torch.from_numpy(padded(c2w, count)).to(device), job.pose_rates(still).to(device)
         left = (1 - torch.arange(iterations) / max(iterations, 1)).to(device)
-        chosen, losses = device_draw(self._bank, views, count, job.config, self.field.layout.box, device), []
+        chosen, losses = device_views(self._bank, views, count, job.config, self.field.layout.box, device), []
         recorder = Recorder(plain=True) if job.smooth else self.recorder
         for part_left in left.split(max(iterations, 1) if job.move else CHUNK):
             interrupt()
@@ -163,12 +163,9 @@ class Mapper:
         box: Tensor,
         jitter: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Iterations as a function of tensors. left: [I]; jitter: [I, R, numbers]; the rest: see ``DeviceDraw``."""
-        chosen = DeviceDraw(pixels, spans, row, box, missing)
-
-        def draw(iteration: int, poses: Tensor) -> RayBatch:
-            return chosen.rays(jitter[iteration], poses, job.config, self.field, self.kernels)
-
+        """Iterations as a function of tensors. left: [I]; jitter: [I, R, numbers]; the rest: see ``DeviceViews``."""
+        views = DeviceViews(pixels, spans, row, box, missing)
+        draw = DeviceDraw(views, jitter, c2w, job.config, self.field, self.kernels)
         return self._iterate(job, draw, c2w, rates, left.unbind(), lambda: None)
 
     def _iterate(
@@ -185,7 +182,8 @@ class Mapper:
         poses, losses = PoseAdam(c2w, rates, kernels=self.kernels), []
         for iteration, share in enumerate(left):
             interrupt()
-            rays, now = draw(iteration, poses.c2w), poses.c2w.float()
+            now = poses.c2w.float()
+            rays = draw(iteration, now)
             result = self.kernels.step(field.layout, field.params, now, rays, job.weights, self._gradients, job.move)
             if job.smooth and m.smooth_weight > 0:
                 lattice = smooth_lattice(field, m, self._generator)

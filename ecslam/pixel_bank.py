@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 
+from .kernels import DevicePixels
 from .pixels import Pixels
-from .rays import DevicePixels, upload
+from .rays import upload
 
 LEAST_ROOM = 1 << 22  # more room is another place, over which loops are recorded anew
 
@@ -43,17 +44,16 @@ class PixelBank:
         if key not in self._places:
             first, last = self._used, self._used + len(view)
             self._require(last)
-            new = upload(view, self._device)
-            for f in fields(DevicePixels):
-                getattr(self.columns, f.name)[first:last] = getattr(new, f.name)
+            for column, new in zip(self.columns, upload(view, self._device), strict=True):
+                column[first:last] = new
             self._places[key], self._used = Place(view, first, bool((view.depth <= 0).any())), last
         return self._places[key]
 
     def _require(self, rows: int) -> None:
         if rows > len(self.columns.depth):
             old, self.columns = self.columns, self._allocate(2 * rows)
-            for f in fields(DevicePixels):
-                getattr(self.columns, f.name)[: self._used] = getattr(old, f.name)[: self._used]
+            for column, held in zip(self.columns, old, strict=True):
+                column[: self._used] = held[: self._used]
 
     def _allocate(self, rows: int) -> DevicePixels:
         rows = max(rows, LEAST_ROOM)

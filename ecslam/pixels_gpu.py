@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config
-from .kernels import tracking_gpu
+from .kernels import DevicePixels, tracking_gpu
 from .kernels.tracking_gpu import Cells, Lens, Marks
 from .observed import LEAST_KNOWN, VOXEL_M
 from .observed_gpu import ObservedTable
 from .pixels import LUMINANCE, border_of, feature_points, grid_shape
-from .rays import DevicePixels
 from .types import Frame, Intrinsics
 
 
@@ -71,11 +70,10 @@ def choose(
     ``corners`` [C] of the frame (-1: none), the rest come from the uniform grid, some of whose cells go without;
     without FUS all are uniform random. order: the cells of that grid [grid_cells], shuffled."""
     cells = _cells(frame, len(jitter) if config.fus else 1, config)
-    found = tracking_gpu.chosen(
+    return tracking_gpu.chosen(
         frame.color, frame.depth, jitter, corners, order if config.fus else None, cells, _lens(camera, config),
         Marks(observed.marks.view(torch.uint8), len(observed.marks), 1 / VOXEL_M), c2w, LEAST_KNOWN,
     )  # fmt: skip
-    return DevicePixels(found.direction, found.depth, found.color, found.feature.view(torch.bool))
 
 
 def _lens(camera: Intrinsics, config: Config) -> Lens:

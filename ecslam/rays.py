@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -11,30 +11,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config, LossWeights
-from .kernels import RayBatch, Weights
+from .kernels import DevicePixels, RayBatch, Weights
 from .pixels import Pixels
 from .samples import ray_exit, sample_depths
-
-
-@dataclass(frozen=True)
-class DevicePixels:
-    """``Pixels`` as tensors on one device. direction: float32 [N, 3], z = 1. depth: float32 [N]. color: uint8 [N, 3].
-    feature: bool [N]."""
-
-    direction: Tensor
-    depth: Tensor
-    color: Tensor
-    feature: Tensor
-
-    def take(self, index: Tensor | slice) -> DevicePixels:
-        """The pixels at ``index``."""
-        return DevicePixels(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
 def upload(pixels: Pixels, device: torch.device) -> DevicePixels:
     """The same pixels on ``device``."""
     return DevicePixels(
-        torch.nn.functional.pad(torch.from_numpy(pixels.direction).to(device), (0, 1), value=1.0),
+        torch.from_numpy(np.pad(pixels.direction, ((0, 0), (0, 1)), constant_values=1)).to(device),
         torch.from_numpy(pixels.depth).to(device),
         torch.from_numpy(pixels.color).to(device),
         torch.from_numpy(pixels.feature).to(device),
@@ -60,17 +45,22 @@ def make_rays(
     """
     far = torch.full_like(pixels.depth, config.depth_far_m)
     if missing:
-        poses = c2w.to(far)[row]
+        poses = c2w.to(far).index_select(0, row)
         world = (poses[:, :3, :3] @ pixels.direction[:, :, None])[:, :, 0]
         far = ray_exit(poses[:, :3, 3], world, box, config.depth_far_m)
     return RayBatch(
         direction=pixels.direction,
         z=sample_depths(pixels.depth, far, config.sampling, jitter),
         depth=pixels.depth,
-        color=pixels.color.float() / 255,
+        color=_fractions(pixels.color),
         feature=pixels.feature,
         pose=row,
     )
+
+
+def _fractions(color: Tensor) -> Tensor:
+    """uint8 as float32 in 0..1. numpy does it alone, torch wakes its threads, which a busy CPU keeps it waiting for."""
+    return torch.from_numpy(color.numpy() / np.float32(255)) if color.device.type == "cpu" else color.float() / 255
 
 
 def view_centre(rays: RayBatch) -> Tensor:

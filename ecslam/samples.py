@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from .config import SamplingConfig
 from .field import TsdfField
-from .kernels import Backend, RayBatch
+from .kernels import Backend, RayBatch, depths_cpu
 
 LEAST_UNIFORM = 4  # fewer samples say too little about where the surface is
 
@@ -35,6 +37,13 @@ def sample_depths(depth: Tensor, far: Tensor, config: SamplingConfig, jitter: Te
     without one (depth 0) get all their samples uniformly out to ``far`` [R]; see ``importance_depths``. jitter:
     [R, uniform + near_depth] in 0..1.
     """
+    if depth.device.type == "cpu":
+        return depths_cpu.sample(depth, far, jitter, config.uniform, config.near_m, config.depth_range_m)
+    return sample_plain(depth, far, config, jitter)
+
+
+def sample_plain(depth: Tensor, far: Tensor, config: SamplingConfig, jitter: Tensor) -> Tensor:
+    """``sample_depths``, readable, on any device."""
     n_u, n_d, reach = config.uniform, config.near_depth, config.depth_range_m
     has = depth > 0
     near = torch.full_like(depth, config.near_m)
@@ -42,12 +51,7 @@ def sample_depths(depth: Tensor, far: Tensor, config: SamplingConfig, jitter: Te
     start = torch.where(has, (depth - reach).clamp_min(config.near_m), near)
     along = stratified(near, end, n_u, jitter[:, :n_u])
     around = stratified(start, end, n_d, jitter[:, n_u:])
-    return ascending(torch.cat([along, around], 1))
-
-
-def ascending(z: Tensor) -> Tensor:
-    """The rows of z [R, S] sorted; numpy does it eight times faster than torch on a CPU."""
-    return torch.from_numpy(np.sort(z.numpy(), axis=1)) if z.device.type == "cpu" else z.sort(1).values
+    return torch.cat([along, around], 1).sort(1).values
 
 
 def importance_depths(z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
@@ -63,29 +67,56 @@ def importance_depths(z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
     return z0 + (u - c0) / (c1 - c0).clamp_min(1e-8) * (z1 - z0)
 
 
-def rendered_depths(
-    rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, config: SamplingConfig, jitter: Tensor
+def follow(z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
+    """Depths [R, S + K], ascending: z [R, S], which ascend, and ``importance_depths`` drawn from their weights."""
+    fused = depths_cpu.follow if z.device.type == "cpu" else _follow_on_gpu() if z.is_cuda else follow_plain
+    return fused(z, weights, jitter)
+
+
+@cache
+def _follow_on_gpu() -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """``follow`` in one launch, if Triton can run."""
+    try:
+        from .kernels.depths_gpu import follow as fused
+    except ImportError:
+        return follow_plain
+    return fused
+
+
+def follow_plain(z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
+    """``follow``, readable, on any device."""
+    return torch.cat([z, importance_depths(z, weights, jitter)], 1).sort(1).values
+
+
+def thinned(z: Tensor, config: SamplingConfig) -> Tensor:
+    """``uniform`` of the depths [R, S] of each ray, which the others are to follow."""
+    keep = (torch.arange(config.uniform, device=z.device) * (z.shape[1] / config.uniform)).long()
+    return z.index_select(1, keep)
+
+
+def rendered_depths(rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, jitter: Tensor) -> Tensor:
+    """Depths [R, S + K] of rays without a measured one: their own [R, S], and as many as ``jitter`` [R, K] in 0..1 has
+    where the map has its surface."""
+    _, _, weights = kernels.render(field.layout, field.params, c2w, rays)
+    return follow(rays.z, weights, jitter)
+
+
+def resampled(
+    rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, config: SamplingConfig, generator: torch.Generator
 ) -> Tensor:
-    """Depths [R, S] of rays without a measured one: ``uniform`` of their own samples, the rest where the map has its
-    surface. jitter: [R, S - uniform] in 0..1."""
-    keep = (torch.arange(config.uniform, device=rays.z.device) * (rays.z.shape[1] / config.uniform)).long()
-    z = rays.z[:, keep].contiguous()
-    _, _, weights = kernels.render(field.layout, field.params, c2w, replace(rays, z=z))
-    return ascending(torch.cat([z, importance_depths(z, weights, jitter)], 1))
+    """Depths [R, S] for rays of which none has a measured one: some of their own, the rest ``rendered_depths``."""
+    if config.uniform < LEAST_UNIFORM:
+        return rays.z
+    jitter = uniform(generator, rays.z.device, len(rays.z), rays.z.shape[1] - config.uniform)
+    return rendered_depths(replace(rays, z=thinned(rays.z, config)), c2w, field, kernels, jitter)
 
 
 def resample_missing(
     rays: RayBatch, c2w: Tensor, field: TsdfField, kernels: Backend, config: SamplingConfig, generator: torch.Generator
-) -> RayBatch:
-    """Rays without depth, of which there are some, get ``rendered_depths``. Waits for the device."""
+) -> None:
+    """Those of the rays that have no depth are ``resampled``, in place. Waits for the device."""
     missing = torch.nonzero(rays.depth <= 0)[:, 0]
-    if config.uniform < LEAST_UNIFORM:
-        return rays
-    few = rays.take(missing)
-    jitter = uniform(generator, rays.z.device, len(missing), rays.z.shape[1] - config.uniform)
-    depths = rays.z.clone()
-    depths[missing] = rendered_depths(few, c2w, field, kernels, config, jitter)
-    return replace(rays, z=depths)
+    rays.z.index_copy_(0, missing, resampled(rays.take(missing), c2w, field, kernels, config, generator))
 
 
 def seeded(rng: np.random.Generator, device: torch.device) -> torch.Generator:

@@ -99,7 +99,7 @@ def track_adam(
     jitter = uniform(generator, device, len(pixels), s.uniform + s.near_depth)
     rays = make_rays(upload(pixels, device), row, c2w, field.layout.box.to(device), config, jitter, missing)
     if missing:
-        rays = resample_missing(rays, c2w.float(), field, kernels, s, generator)
+        resample_missing(rays, c2w.float(), field, kernels, s, generator)
     scale = t.unaligned_rate if config.align.to == "none" else 1.0
     rates = scale * pose_rates(torch.zeros(1, dtype=torch.bool), t.lr_rotation, t.lr_translation).to(device)
     weights = kernel_weights(t.loss, config)

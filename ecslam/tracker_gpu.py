@@ -18,7 +18,7 @@ from .align import LEAST_KNOWN, stages
 from .config import Config
 from .descent import COARSE_STRIDE, RULES, outlier_cost
 from .field import TsdfField
-from .kernels import LOSS_NAMES, AlignSettings, Backend, RayBatch, fusion_gpu, tracking_gpu
+from .kernels import LOSS_NAMES, AlignSettings, Backend, DevicePixels, RayBatch, fusion_gpu, tracking_gpu
 from .kernels._gpu_blocks import Blocks
 from .kernels._gpu_descent import COUNT
 from .kernels.graphs import Recorder
@@ -26,7 +26,7 @@ from .kernels.tracking_gpu import TOLD
 from .observed_gpu import ObservedTable
 from .pixels_gpu import DeviceFrame, choose, grid_cells, padded_corners, spread
 from .pose_adam import pose_rates
-from .rays import DevicePixels, kernel_weights, make_rays
+from .rays import kernel_weights, make_rays
 from .samples import uniform
 from .tracker import LEAST_POINTS, LEAST_SEEN, TrackResult, descend_rendered
 from .types import Frame, Intrinsics

@@ -27,9 +27,10 @@ from on_gpu import DEVICE, INTERPRETED, moved, run
 
 from ecslam.config import FieldConfig
 from ecslam.field import grow_field
-from ecslam.kernels import FieldParams, PoseMoments, gpu, reference
+from ecslam.kernels import FieldParams, PoseMoments, depths_gpu, gpu, reference
 from ecslam.kernels.poses_gpu import pose_step
 from ecslam.pose_adam import BETA2, EPSILON, PoseAdam
+from ecslam.samples import follow_plain
 
 torch.set_num_threads(1)
 SIZES = (0, 1, 63, 64, 65, 300)
@@ -234,3 +235,16 @@ def test_a_step_of_the_poses(poses, about):
         found = pose_step(found, gradient.to(DEVICE), moments, rates, count)
     torch.testing.assert_close(found.cpu(), expected.c2w, rtol=0, atol=1e-8)
     assert poses == 1 or (found.cpu() - c2w).abs().max() > 0.01
+
+
+@pytest.mark.parametrize(("rays", "samples", "more"), [(0, 32, 11), (1, 8, 11), (37, 32, 11), (6, 33, 17), (5, 96, 21)])
+def test_depths_that_follow_a_rendering(rays, samples, more):
+    random = torch.Generator().manual_seed(rays)
+    z = (4 * torch.rand(rays, samples, generator=random)).sort(1).values
+    weights = torch.exp(-(((z - z[:, 2:3]) / 0.2) ** 2))
+    weights[::5] = 0
+    jitter = torch.rand(rays, 2 * more, generator=random)[:, ::2]
+    found = run(depths_gpu.follow, z, weights, jitter)
+    assert_close([found], [follow_plain(z.double(), weights.double(), jitter.double())])
+    assert (found.diff(dim=1) >= 0).all()
+    assert torch.isin(z, found).all()

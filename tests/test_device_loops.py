@@ -1,5 +1,6 @@
 """Mapping and tracking as a GPU does them, on the CPU: rays drawn on the device, loops that a CUDA graph can record."""
 
+from dataclasses import fields
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,9 +12,9 @@ from ecslam import field_adam
 from ecslam import kernels as seam
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
-from ecslam.draws import device_draw, shares
+from ecslam.draws import DeviceDraw, device_views, shares
 from ecslam.field import create_field
-from ecslam.kernels import FieldParams, StepResult, reference
+from ecslam.kernels import FieldParams, RayBatch, StepResult, reference
 from ecslam.kernels.graphs import Recorder
 from ecslam.keyframes import make_keyframe
 from ecslam.mapper import Job, Mapper
@@ -254,14 +255,32 @@ def test_a_bank_holds_every_view_once_and_grows(monkeypatch):
 def test_rays_come_from_their_own_view_in_the_shares_asked_for(config):
     views = [flat(count, value) for count, value in ((5, 1), (1, 2), (40, 3))]
     bank, generator = PixelBank(CPU), torch.Generator().manual_seed(0)
-    drawn = device_draw(bank, views, 5, config, torch.from_numpy(BOX).float(), CPU)
-    jitter = uniform(generator, CPU, config.mapping.rays, drawn.numbers(config))
-    rays = drawn.rays(jitter, torch.eye(4).expand(5, 4, 4), config, None, None)
+    chosen = device_views(bank, views, 5, config, torch.from_numpy(BOX).float(), CPU)
+    jitter = uniform(generator, CPU, 2, config.mapping.rays, chosen.numbers(config))
+    rays = DeviceDraw(chosen, jitter, torch.eye(4).expand(5, 4, 4), config, None, None)(1, None)
     assert len(rays.depth) == config.mapping.rays
     assert (rays.pose.diff() >= 0).all()
     assert torch.equal(rays.depth, rays.pose.float() + 1)
     counts = np.array(shares(3, config.mapping.rays, config.mapping.newest_share))
     assert np.abs(np.bincount(rays.pose.numpy()) - counts).max() <= 3
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.3])
+def test_rays_drawn_at_once_are_those_that_each_iteration_would_draw(room, config, holes):
+    views, poses = keyframes(room, config, holes)
+    one = mapper(room, config)
+    c2w, box = torch.from_numpy(poses), one.field.layout.box
+    chosen = device_views(one._bank, views, len(views), config, box, CPU)
+    jitter = uniform(torch.Generator().manual_seed(0), CPU, 3, config.mapping.rays, chosen.numbers(config))
+    assert chosen.missing == (holes > 0)
+    together = DeviceDraw(chosen, jitter, c2w, config, one.field, one.kernels)
+    for i in range(3):
+        rays = together(i, c2w.float())
+        alone = DeviceDraw(chosen, jitter[i : i + 1], c2w, config, one.field, one.kernels)(0, c2w.float())
+        for f in fields(RayBatch):
+            found = getattr(rays, f.name)
+            assert found.is_contiguous()
+            assert torch.equal(found, getattr(alone, f.name))
 
 
 def test_rates_of_fixed_poses_are_zero():

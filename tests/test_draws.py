@@ -26,7 +26,7 @@ def view(depth_m, rng, missing=0):
 def drawn(iterations, missing=0, seed=0):
     rng = np.random.default_rng(0)
     views = [view(depth_m, rng, missing) for depth_m in (1.0, 1.5, 0.5)]
-    field, poses = create_field(CONFIG.field, BOX, 0, torch.device("cpu")), torch.eye(4).double().repeat(3, 1, 1)
+    field, poses = create_field(CONFIG.field, BOX, 0, torch.device("cpu")), torch.eye(4).repeat(3, 1, 1)
     generator = torch.Generator().manual_seed(seed)
     draw = HostDraw(views, CONFIG, field, reference, np.random.default_rng(seed), generator)
     return views, [draw(i, poses) for i in range(iterations)]

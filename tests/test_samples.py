@@ -2,13 +2,24 @@
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecslam.config import SamplingConfig
 from ecslam.kernels import RayBatch
-from ecslam.samples import importance_depths, ray_exit, rendered_depths, sample_depths, stratified
+from ecslam.samples import (
+    follow,
+    follow_plain,
+    importance_depths,
+    ray_exit,
+    rendered_depths,
+    sample_depths,
+    sample_plain,
+    stratified,
+    thinned,
+)
 
 
 def jitter(*shape, seed=0):
@@ -65,15 +76,31 @@ class Wall:
 def test_rendered_depths_look_for_the_surface_along_the_whole_ray():
     zero, config, wall = torch.zeros(5), SamplingConfig(uniform=16, near_depth=5), Wall()
     z = sample_depths(zero, torch.full((5,), 4.0), config, torch.full((5, 21), 0.5))
-    rays = RayBatch(torch.ones(5, 3), z, zero, torch.zeros(5, 3), zero > 0, zero.long())
+    rays = RayBatch(torch.ones(5, 3), thinned(z, config), zero, torch.zeros(5, 3), zero > 0, zero.long())
     field = SimpleNamespace(layout=None, params=None)
-    found = rendered_depths(rays, torch.eye(4)[None], field, wall, config, jitter(5, 5))
+    found = rendered_depths(rays, torch.eye(4)[None], field, wall, jitter(5, 5))
     assert wall.looked.shape == (5, 16)
     assert wall.looked.max() > 3.6
     assert wall.looked.diff(dim=1).max() < 0.6
     assert found.shape == z.shape
     assert (found.diff(dim=1) >= 0).all()
     assert ((found - 2.5).abs() < 0.5).sum(1).ge(5 + 3).all(), "the new ones and those that were there"
+
+
+@pytest.mark.parametrize("rays", [0, 1, 300])
+@pytest.mark.parametrize(("uniform", "near_depth"), [(32, 11), (8, 11), (0, 11), (4, 1), (96, 21)])
+def test_on_a_cpu_one_pass_finds_the_same_bits(rays, uniform, near_depth):
+    config = SamplingConfig(uniform=uniform, near_depth=near_depth, near_m=0.3)
+    depth, far = 5 * jitter(rays, seed=1), 0.2 + 4 * jitter(rays, seed=2)
+    depth[::4], depth[1::9], depth[2::9] = 0, 0.1, 0.32
+    numbers = jitter(rays, uniform + near_depth, seed=3)
+    z = sample_depths(depth, far, config, numbers)
+    assert torch.equal(z, sample_plain(depth, far, config, numbers))
+    if uniform:
+        z, more = thinned(z, config), jitter(rays, 2 * near_depth, seed=4)[:, ::2]
+        weights = jitter(rays, uniform, seed=5) ** 8
+        weights[::5], weights[1::5, 2:] = 0, 0
+        assert torch.equal(follow(z, weights, more), follow_plain(z, weights, more))
 
 
 def test_ray_exit_of_a_box():

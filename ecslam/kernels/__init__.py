@@ -21,6 +21,7 @@ from ..types import InputError
 from .types import (
     LOSS_NAMES,
     AlignSettings,
+    DevicePixels,
     FieldParams,
     GridLayout,
     NormalEquations,
@@ -35,6 +36,7 @@ __all__ = [
     "LOSS_NAMES",
     "AlignSettings",
     "Backend",
+    "DevicePixels",
     "FieldParams",
     "GridLayout",
     "NormalEquations",

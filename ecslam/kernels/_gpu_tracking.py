@@ -52,15 +52,6 @@ class Lens(NamedTuple):
     far: float
 
 
-class Columns(NamedTuple):
-    """Pixels, a row each: direction float32 [N, 3], depth float32 [N], color uint8 [N, 3], feature uint8 [N]."""
-
-    direction: Tensor
-    depth: Tensor
-    color: Tensor
-    feature: Tensor
-
-
 @triton.jit
 def pixel_in(cells, cell, along_v, along_u):
     """Column and row of the pixel at a share, 0..1 each way, of each cell."""

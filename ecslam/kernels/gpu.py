@@ -164,7 +164,8 @@ def render(layout: GridLayout, params: FieldParams, c2w: Tensor, rays: RayBatch)
     """See ``reference.render``."""
     targets = _targets(rays)
     z = targets.z
-    color, depth, weights = z.new_zeros(targets.rays, 3), z.new_zeros(targets.rays), torch.zeros_like(z)
+    new = z.new_empty if z.numel() else z.new_zeros
+    color, depth, weights = new(targets.rays, 3), new(targets.rays), new(z.shape)
     if z.numel():
         grid, sizes = _ray_grid(targets.rays, targets.samples)
         with beside(z):

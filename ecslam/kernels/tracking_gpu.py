@@ -10,7 +10,6 @@ from ._gpu_descent import COST, COUNT, ROW
 from ._gpu_device import beside
 from ._gpu_tracking import (
     Cells,
-    Columns,
     Lens,
     Marks,
     choose_kernel,
@@ -20,8 +19,9 @@ from ._gpu_tracking import (
     told_kernel,
 )
 from .fusion_gpu import distances
+from .types import DevicePixels
 
-__all__ = ["TOLD", "Cells", "Columns", "Lens", "Marks", "chosen", "packed", "spread", "told"]
+__all__ = ["TOLD", "Cells", "Lens", "Marks", "chosen", "packed", "spread", "told"]
 
 BLOCK = 128
 WHOLE, WHOLE_WARPS = 1024, 8  # points at a time for a program that sees them all
@@ -75,7 +75,7 @@ def chosen(
     observed: Marks,
     c2w: Tensor,
     least: int,
-) -> Columns:
+) -> DevicePixels:
     """Pixels of a frame, as many as ``jitter`` [N, 3] in 0..1 has rows: ``corners`` [C] (-1: none), then those in cells
     of ``order`` [cells], from a random one on; anywhere in the only cell without it. They are taken in turn from those
     that lie where the map has been ``observed``, seen from c2w float64 [4, 4]; from all that have a depth where these
@@ -84,7 +84,7 @@ def chosen(
     sizes = (count, 3), (count,), (count, 3), (count,)
     floats, bytes_ = depth.new_empty, color.new_empty
     found, kept = (
-        Columns(*(new(size) for new, size in zip((floats, floats, bytes_, bytes_), sizes, strict=True)))
+        DevicePixels(*(new(size) for new, size in zip((floats, floats, bytes_, bytes_), sizes, strict=True)))
         for _ in range(2)
     )
     known = bytes_(count)
@@ -94,4 +94,4 @@ def chosen(
             known, cells, lens, len(corners), grid, count, gridded=order is not None, block=BLOCK,
         )  # fmt: skip
         keep_kernel[(1,)](found, known, kept, count, least, block=WHOLE, num_warps=WHOLE_WARPS)
-    return kept
+    return kept._replace(feature=kept.feature.view(torch.bool))

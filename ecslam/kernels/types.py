@@ -59,6 +59,25 @@ class FieldParams:
     beta: Tensor
 
 
+def taken(rows: Tensor, index: Tensor | slice) -> Tensor:
+    """``rows[index]``, on a CPU without waking torch's threads for a few thousand numbers."""
+    return rows[index] if isinstance(index, slice) else rows.index_select(0, index)
+
+
+class DevicePixels(NamedTuple):
+    """``Pixels`` as tensors on one device. direction: float32 [N, 3], z = 1. depth: float32 [N]. color: uint8 [N, 3].
+    feature: bool [N]."""
+
+    direction: Tensor
+    depth: Tensor
+    color: Tensor
+    feature: Tensor
+
+    def take(self, index: Tensor | slice) -> DevicePixels:
+        """The pixels at ``index``."""
+        return DevicePixels(*(taken(column, index) for column in self))
+
+
 @dataclass(frozen=True)
 class RayBatch:
     """Rays to render, in camera coordinates, so that an iteration only transforms them.
@@ -77,7 +96,7 @@ class RayBatch:
 
     def take(self, index: Tensor | slice) -> RayBatch:
         """The rays at ``index``."""
-        return RayBatch(*(getattr(self, f.name)[index] for f in fields(self)))
+        return RayBatch(*(taken(getattr(self, f.name), index) for f in fields(self)))
 
 
 @dataclass(frozen=True)
