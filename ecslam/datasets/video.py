@@ -1,0 +1,108 @@
+"""Frames of a video by number, whatever the order and from any thread.
+
+OpenCV counts frames by time and mean rate, so seeking to a number lands beside it where the rate varies, and a frame
+shown before time 0 is left out altogether, with which all others move up. Here the file's own tables say which frames
+there are, and the time of what was decoded says which one it is.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import FrameError
+from .mp4 import read_track
+
+MOST_THREADS = 8  # of the decoder, each with pictures of its own
+FAR = 60  # frames ahead, from which on seeking is quicker than decoding on
+SAME_S = 5e-4
+
+os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "ignore_editlist;1")
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # broken videos raise an exception
+
+
+class Video:
+    """An MP4 file's frames, shrunk to ``size`` (width, height). One decoder, which goes forwards as long as it can.
+
+    track: what the file's tables say. Raises InputError for a file that is no video.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int] | None = None) -> None:
+        self.path, self.track = path, read_track(path)
+        self.size = size or self.track.size
+        self._decoding = threading.Lock()
+        self._wanted: list[int] = []  # by the threads that wait, and by the one that decodes
+        self._found: dict[int, NDArray[np.uint8]] = {}  # what these wait for and was passed on the way
+        self._capture: cv2.VideoCapture | None = None
+        self._at = -1  # the number of the frame decoded last
+
+    def __len__(self) -> int:
+        return len(self.track.times)
+
+    def read(self, number: int) -> NDArray[np.uint8]:
+        """Frame ``number`` in the order of display, RGB uint8 [H, W, 3]. Raises FrameError."""
+        self._wanted.append(number)
+        with self._decoding:
+            try:
+                return self._found[number] if number in self._found else self._decode(number)
+            finally:
+                self._wanted.remove(number)
+                self._found = {n: image for n, image in self._found.items() if n in self._wanted}
+
+    def _decode(self, number: int) -> NDArray[np.uint8]:
+        if self._capture is None or not self._at <= number <= self._at + FAR:
+            self._seek(number)
+        while self._at < number and self._advance():
+            if self._at in self._wanted and self._at != number:
+                with suppress(FrameError):  # it is told to who asks for that frame
+                    self._found[self._at] = self._picture()
+        if self._at != number:
+            raise FrameError(self._broken(number))
+        return self._picture()
+
+    def _seek(self, number: int) -> None:
+        """To a frame at or before ``number``, or to before the first one."""
+        if number > FAR:
+            capture = self._capture or self._rewind()
+            rate = capture.get(cv2.CAP_PROP_FPS)
+            capture.set(cv2.CAP_PROP_POS_FRAMES, max(int(self.track.times[number] * rate) - 1, 0))
+            if self._advance() and self._at <= number:
+                return
+        self._rewind()
+
+    def _rewind(self) -> cv2.VideoCapture:
+        threads = min(os.cpu_count() or 1, MOST_THREADS)
+        self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # its default depends on the version
+        self._at = -1
+        return self._capture
+
+    def _advance(self) -> bool:
+        """Decode the next frame and find out which it is; False at the end, or where that cannot be told."""
+        capture: Any = self._capture
+        if capture.grab():
+            times, time_s = self.track.times, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            at = int(np.searchsorted(times, time_s - SAME_S))
+            if at < len(times) and times[at] <= time_s + SAME_S:
+                self._at = at
+                return True
+        self._capture, self._at = None, -1
+        return False
+
+    def _picture(self) -> NDArray[np.uint8]:
+        capture: Any = self._capture
+        ok, image = capture.retrieve()
+        if not ok or image.dtype != np.uint8 or image.shape != (self.track.size[1], self.track.size[0], 3):
+            raise FrameError(self._broken(self._at))
+        small = image if self.size == self.track.size else cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB), np.uint8)
+
+    def _broken(self, number: int) -> str:
+        return f"{self.path}: frame {number} cannot be decoded; copy the video again"
