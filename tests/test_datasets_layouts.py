@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import phone
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -123,21 +124,15 @@ def write_scannet(root: Path) -> Path:
 
 def write_stray(root: Path) -> Path:
     """Colour four times as fine as frames, depth half as fine."""
-    root.mkdir(parents=True, exist_ok=True)
-    video = cv2.VideoWriter(str(root / "rgb.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, (4 * W, 4 * H))
-    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
-    for i in range(N):
-        video.write(np.ascontiguousarray(picture(i, 4 * W, 4 * H)[..., ::-1]))
-        write(root / f"depth/{i:06d}.png", depth_values(1000)[: H // 2, : W // 2])
-        write(root / f"confidence/{i:06d}.png", np.full((H // 2, W // 2), 2, np.uint8))
-        c2w = Y_UP @ pose(i)
-        quaternion = Rotation.from_matrix(c2w[:3, :3]).as_quat()
-        lines.append(", ".join(map(str, [f"{5000 + i / 30:.9f}", f"{i:06d}", *c2w[:3, 3], *quaternion])))
-    video.release()
-    (root / "odometry.csv").write_text("\n".join(lines))
     matrix = np.array([[4 * K[0, 0], 0, 4 * K[0, 2] + 1.5], [0, 4 * K[1, 1], 4 * K[1, 2] + 1.5], [0, 0, 1]])
-    np.savetxt(root / "camera_matrix.csv", matrix, delimiter=", ")
-    return root
+    return phone.record(
+        root,
+        [picture(i, 4 * W, 4 * H) for i in range(N)],
+        [depth_values(1000)[: H // 2, : W // 2]] * N,
+        [Y_UP @ pose(i) for i in range(N)],
+        matrix,
+        fps=30,
+    )
 
 
 def write_neuralrgbd(root: Path) -> Path:
