@@ -79,13 +79,25 @@ def test_a_frame_is_the_same_to_the_last_bit_whichever_way_it_was_reached(path: 
         np.testing.assert_array_equal(seeking.read(number), frames[number])
 
 
+def count_openings(video: Video) -> list[int]:
+    """A list that grows by one with each start from the first frame."""
+    opened: list[int] = []
+    rewind = video._rewind
+
+    def counted() -> cv2.VideoCapture:
+        opened.append(1)
+        return rewind()
+
+    video._rewind = counted  # type: ignore[method-assign]
+    return opened
+
+
 @pytest.mark.parametrize("threads", [2, 6])
 @pytest.mark.parametrize("step", [1, 3])
 def test_threads_that_read_ahead_get_their_own_frames_from_one_pass(path: Path, threads: int, step: int) -> None:
     video = Video(path)
     wanted = list(range(0, N, step))
-    opened = []
-    rewind, video._rewind = video._rewind, lambda: opened.append(1) or rewind()  # type: ignore[func-returns-value, method-assign]
+    opened = count_openings(video)
     with ThreadPoolExecutor(threads) as pool:
         assert [number_in(image) for image in pool.map(video.read, wanted)] == wanted
     assert len(opened) <= 3
@@ -183,12 +195,24 @@ def test_frames_that_cannot_be_decoded_are_frame_errors_and_spare_the_rest(data:
     third = (end - start) // 3
     path.write_bytes(data[: start + third] + bytes(third) + data[start + 2 * third :])
     video = Video(path)
-    broken = []
+    opened, broken = count_openings(video), []
     for number in range(N):
         try:
             video.read(number)
         except FrameError as error:
             broken.append((number, str(error)))
-    assert 0 < len(broken) < N
+    assert len(opened) == 1
+    assert {N // 2} <= {number for number, _ in broken} <= set(range(N // 3 - 8, 2 * N // 3 + 24))
     assert all(f"{path}: frame {number} cannot be decoded" in text for number, text in broken)
-    assert [number_in(video.read(number)) for number in (N - 1, 2)] == [N - 1, 2]
+    assert [number_in(video.read(number)) for number in (N - 1, N - 1, 2)] == [N - 1, N - 1, 2]
+
+
+def test_a_video_that_ends_early_keeps_the_frames_it_has(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "rgb.mp4"
+    start, end = data.index(b"mdat") + 4, data.index(b"moov")
+    half = (start + end) // 2
+    path.write_bytes(data[:half] + bytes(end - 4 - half) + data[end - 4 :])
+    video = Video(path)
+    with pytest.raises(FrameError, match=f"frame {N - 1} cannot"):
+        video.read(N - 1)
+    assert [number_in(video.read(number)) for number in (0, 70, 71)] == [0, 70, 71]

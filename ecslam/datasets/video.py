@@ -22,6 +22,7 @@ from .mp4 import read_track
 
 MOST_THREADS = 8  # of the decoder, each with pictures of its own
 FAR = 60  # frames ahead, from which on seeking is quicker than decoding on
+TRIES = 1000  # until damaged data are taken for the end of the file
 SAME_S = 5e-4
 
 os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "ignore_editlist;1")
@@ -42,6 +43,7 @@ class Video:
         self._found: dict[int, NDArray[np.uint8]] = {}  # what these wait for and was passed on the way
         self._capture: cv2.VideoCapture | None = None
         self._at = -1  # the number of the frame decoded last
+        self._lost: set[int] = set()  # what the decoder passed over
 
     def __len__(self) -> int:
         return len(self.track.times)
@@ -60,15 +62,29 @@ class Video:
         return self._shrunk(image)
 
     def _decode(self, number: int) -> NDArray[np.uint8]:
+        if number not in self._lost:
+            self._go_to(number)
+        if self._at != number:
+            raise FrameError(f"{self.path}: frame {number} cannot be decoded; copy the video again")
+        return self._picture()
+
+    def _go_to(self, number: int) -> None:
+        """Decode until it is ``number``'s turn, or clear that it cannot be decoded."""
         if self._capture is None or not self._at <= number <= self._at + FAR:
             self._seek(number)
-        while self._at < number and self._advance():
+        tries = TRIES
+        while self._at < number and tries:
+            before = self._at
+            if not self._advance():
+                tries -= 1
+                continue
+            self._lost.update(range(before + 1, self._at))
             if self._at in self._wanted and self._at != number:
                 with suppress(FrameError):  # it is told to who asks for that frame
                     self._found[self._at] = self._shrunk(self._picture())
-        if self._at != number:
-            raise FrameError(self._broken(number))
-        return self._picture()
+        if self._at < number:
+            self._lost.update(range(self._at + 1, number + 1))
+            self._capture = None  # for whatever it holds now
 
     def _seek(self, number: int) -> None:
         """To a frame at or before ``number``, or to before the first one."""
@@ -88,22 +104,22 @@ class Video:
         return self._capture
 
     def _advance(self) -> bool:
-        """Decode the next frame and find out which it is; False at the end, or where that cannot be told."""
+        """Decode on and find out which frame that is; False at the end, in damaged data, or where it cannot be told."""
         capture: Any = self._capture
-        if capture.grab():
-            times, time_s = self.track.times, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            at = int(np.searchsorted(times, time_s - SAME_S))
-            if at < len(times) and times[at] <= time_s + SAME_S:
-                self._at = at
-                return True
-        self._capture, self._at = None, -1
-        return False
+        if not capture.grab():
+            return False
+        times, time_s = self.track.times, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        at = int(np.searchsorted(times, time_s - SAME_S))
+        if at == len(times) or times[at] > time_s + SAME_S:
+            return False
+        self._at = at
+        return True
 
     def _picture(self) -> NDArray[np.uint8]:
         capture: Any = self._capture
         ok, image = capture.retrieve()
         if not ok or image.dtype != np.uint8 or image.shape != (self.track.size[1], self.track.size[0], 3):
-            raise FrameError(self._broken(self._at))
+            raise FrameError(f"{self.path}: frame {self._at} is damaged; copy the video again")
         return cast("NDArray[np.uint8]", image)
 
     def _shrunk(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -115,6 +131,3 @@ class Video:
             if image.shape[1::-1] != size:
                 image = cast("NDArray[np.uint8]", cv2.resize(image, size, interpolation=cv2.INTER_AREA))
         return cast("NDArray[np.uint8]", cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-
-    def _broken(self, number: int) -> str:
-        return f"{self.path}: frame {number} cannot be decoded; copy the video again"
