@@ -155,7 +155,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "stray": write_stray,
     "neuralrgbd": write_neuralrgbd,
 }
-PRESETS = {"tum": "tum", "scannet": "scannet", "stray": "scannet"}
+PRESETS = {"tum": "tum", "scannet": "scannet"}
 
 
 # ---- the contract ----

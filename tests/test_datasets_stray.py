@@ -296,7 +296,7 @@ def test_a_camera_that_looks_straight_down_is_not_turned(tmp_path: Path) -> None
 
 def test_a_check_reads_well(tmp_path: Path) -> None:
     text = format_report(check_sequence(open_sequence(write(tmp_path / "room"))))
-    assert "room (stray layout, preset scannet)" in text
+    assert "room (stray layout, preset lite)" in text
     assert "8, 8 of 8 tried readable" in text
     assert "ARKit's estimate" in text
 

@@ -81,7 +81,7 @@ def open(path: Path) -> PhoneRecording:
     return PhoneRecording(
         name=path.name,
         layout="stray",
-        preset="scannet",
+        preset="lite",
         intrinsics=turned(_lens(path, video.track.size, odometry).resized(*video.size), turns),
         color_files=[],
         depth_files=[depth[number] for number in numbers],
