@@ -102,9 +102,9 @@ class Mesh:
 class Sequence(Protocol):
     """What a data set looks like to the engine. Indexing reads from disk; everything else is cheap.
 
-    name: shown to people, e.g. ``7scenes-redkitchen``. layout: ``7scenes``, ``tum``, ``replica``, ``vmap``,
-    ``scannet`` or ``synthetic``. preset: the preset that suits this layout when the user names none. bounds: float64
-    [2, 3] scene box in metres in the frame of the ground truth, or None when unknown.
+    name: shown to people, e.g. ``7scenes-redkitchen``. layout: ``synthetic``, or as a file of ``datasets`` calls it,
+    e.g. ``tum``. preset: the preset that suits this layout when the user names none. bounds: float64 [2, 3] scene box
+    in metres in the frame of the ground truth, or None when unknown.
     """
 
     name: str

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
+import phone
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,6 +24,7 @@ from ecslam.types import FrameError, InputError, Sequence
 
 W, H, N = 64, 48, 6
 METRES = 2.0
+Y_UP = np.diag([1.0, -1, -1, 1])
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 
 
@@ -119,12 +122,38 @@ def write_scannet(root: Path) -> Path:
     return root
 
 
+def write_stray(root: Path) -> Path:
+    """Colour four times as fine as frames, depth half as fine."""
+    matrix = np.array([[4 * K[0, 0], 0, 4 * K[0, 2] + 1.5], [0, 4 * K[1, 1], 4 * K[1, 2] + 1.5], [0, 0, 1]])
+    return phone.record(
+        root,
+        [picture(i, 4 * W, 4 * H) for i in range(N)],
+        [depth_values(1000)[: H // 2, : W // 2]] * N,
+        [Y_UP @ pose(i) for i in range(N)],
+        matrix,
+        fps=30,
+    )
+
+
+def write_neuralrgbd(root: Path) -> Path:
+    poses = []
+    for i in range(N):
+        write(root / f"images/img{i}.png", picture(i))
+        write(root / f"depth_filtered/depth{i}.png", depth_values(1000))
+        poses.append(pose(i) @ np.diag([1, -1, -1, 1]))
+    save(root / "poses.txt", np.concatenate(poses))
+    (root / "focal.txt").write_text(f"{K[0, 0]}\n")
+    return root
+
+
 WRITERS: dict[str, Callable[[Path], Path]] = {
     "7scenes": write_7scenes,
     "tum": write_tum,
     "replica": write_replica,
     "vmap": write_vmap,
     "scannet": write_scannet,
+    "stray": write_stray,
+    "neuralrgbd": write_neuralrgbd,
 }
 PRESETS = {"tum": "tum", "scannet": "scannet"}
 
@@ -173,11 +202,12 @@ def test_frames_keep_the_types_units_and_poses_of_the_contract(layout: str, fold
         assert frame.depth.shape == (H, W)
         assert frame.depth.dtype == np.float32
         assert frame.depth[0, 0] == frame.depth[0, 1] == 0
-        np.testing.assert_allclose(frame.depth[1:], METRES, atol=1e-4)
+        np.testing.assert_allclose(frame.depth[2:], METRES, atol=1e-4)
         np.testing.assert_allclose(frame.color.astype(int), picture(i), atol=12)
         assert frame.c2w_gt is not None
-        np.testing.assert_allclose(frame.c2w_gt, pose(i), atol=1e-6)
-    np.testing.assert_allclose(poses, [pose(i) for i in range(N)], atol=1e-6)
+        np.testing.assert_allclose(frame.c2w_gt, poses[i])
+    world = Y_UP if layout == "stray" else np.eye(4)
+    np.testing.assert_allclose(poses, [world @ pose(i) for i in range(N)], atol=1e-6)
     assert sequence.reference_mesh() is None
 
 
@@ -187,7 +217,9 @@ def test_an_index_outside_is_an_index_error(folder: Path, index: int) -> None:
         open_sequence(folder)[index]
 
 
-def test_a_missing_depth_image_is_refused_on_opening(folder: Path) -> None:
+def test_a_missing_depth_image_is_refused_on_opening(layout: str, folder: Path) -> None:
+    if layout == "stray":
+        pytest.skip("a phone's frame may be without depth")
     depth_files(folder)[2].unlink()
     with pytest.raises(InputError, match=r"missing|without its depth") as caught:
         open_sequence(folder)
@@ -216,8 +248,8 @@ def test_a_bomb_among_the_images_changes_nothing_for_the_others(folder: Path) ->
 
 
 def test_it_opens_without_ground_truth(folder: Path) -> None:
-    for path in folder.rglob("*.txt"):
-        if any(word in str(path.relative_to(folder)) for word in ("pose", "traj", "groundtruth")):
+    for path in [*folder.rglob("*.txt"), *folder.rglob("*.csv")]:
+        if any(word in str(path.relative_to(folder)) for word in ("pose", "traj", "groundtruth", "odometry")):
             path.unlink()
     sequence = open_sequence(folder)
     assert sequence.poses_gt() is None
@@ -272,7 +304,9 @@ def test_the_error_for_an_unknown_folder_lists_every_layout(tmp_path: Path) -> N
     (tmp_path / "notes.md").write_text("x")
     with pytest.raises(InputError, match=r"notes\.md") as caught:
         open_sequence(tmp_path)
-    assert all(name in str(caught.value) for name in ("7-Scenes", "TUM", "NICE-SLAM", "vMAP", "ScanNet"))
+    assert all(
+        name in str(caught.value) for name in ("7-Scenes", "TUM", "NICE-SLAM", "vMAP", "ScanNet", "Stray", "Neural")
+    )
 
 
 def test_built_in_rooms_go_to_their_own_opener_with_their_options(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -453,6 +487,40 @@ def test_a_broken_reference_mesh_is_an_input_error(tmp_path: Path) -> None:
     (write_replica(tmp_path) / "mesh.ply").write_text("not a mesh")
     with pytest.raises(InputError, match=r"mesh\.ply"):
         open_sequence(tmp_path).reference_mesh()
+
+
+# ---- Neural RGB-D ----
+
+
+def test_neural_rgbd_reads_what_imitates_a_sensor_before_exact_depth(tmp_path: Path) -> None:
+    root = write_neuralrgbd(tmp_path)
+    for i in range(N):
+        write(root / f"depth/depth{i}.png", np.full((H, W), 3000, np.uint16))
+    assert open_sequence(root)[0].depth[5, 5] == METRES
+    shutil.rmtree(root / "depth_filtered")
+    assert open_sequence(root)[0].depth[5, 5] == 3
+
+
+def test_neural_rgbd_leaves_out_poses_that_are_not_numbers(tmp_path: Path) -> None:
+    root = write_neuralrgbd(tmp_path)
+    lines = (root / "poses.txt").read_text().splitlines()
+    lines[4:8], lines[12:16] = ["nan nan nan nan"] * 4, ["-nan(ind) nan(ind) nan nan"] * 4
+    (root / "poses.txt").rename(root / "trainval_poses.txt").write_text("\n".join(lines))
+    sequence = open_sequence(root)
+    assert [frame.c2w_gt is None for frame in sequence] == [False, True, False, True, False, False]
+    np.testing.assert_allclose(sequence[2].c2w_gt, pose(2), atol=1e-6)
+    found = problems(sequence)
+    assert any("itself an estimate" in each for each in found)
+    assert any("2 of 6" in each for each in found)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"), [("60 60", "takes one"), ("nan", "takes one"), ("-5", "focal"), ("x", "number")]
+)
+def test_neural_rgbd_without_a_focal_length_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    (write_neuralrgbd(tmp_path) / "focal.txt").write_text(text)
+    with pytest.raises(InputError, match=says):
+        open_sequence(tmp_path)
 
 
 # ---- TUM ----

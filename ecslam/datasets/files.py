@@ -46,14 +46,14 @@ class FileSequence:
         if not (k.fx > 0 and k.fy > 0 and 0 <= k.cx < k.width and 0 <= k.cy < k.height):
             values = f"fx {k.fx:g}, fy {k.fy:g}, cx {k.cx:g}, cy {k.cy:g}"
             raise InputError(
-                f"{self.color_files[0].parent}: the intrinsics ({values}) do not fit {k.width}x{k.height} images; "
+                f"{self.depth_files[0].parent}: the intrinsics ({values}) do not fit {k.width}x{k.height} images; "
                 "focal lengths must be positive and the centre inside the image"
             )
         if not 0 < self.depth_scale < np.inf:
-            raise InputError(f"{self.color_files[0].parent}: depth scale {self.depth_scale:g} is not a positive number")
+            raise InputError(f"{self.depth_files[0].parent}: depth scale {self.depth_scale:g} is not a positive number")
 
     def __len__(self) -> int:
-        return len(self.color_files)
+        return len(self.depth_files)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[i] for i in range(len(self)))
@@ -62,16 +62,7 @@ class FileSequence:
         """Read frame ``index``. Raises FrameError when a file is unreadable, IndexError outside 0 .. len - 1."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
-        size = (self.intrinsics.width, self.intrinsics.height)
-        color: NDArray[Any] = read_color(self.color_files[index], self.color_size)
-        raw: NDArray[Any] = read_depth(self.depth_files[index], size)
-        if self.color_size != size:
-            color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-        if self.intrinsics.distortion:
-            fixed, fraction, rounded = self._undistortion
-            color = cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR)
-            raw = cv2.remap(raw, rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-        depth = fill_pinholes(to_metres(raw, self.depth_scale))
+        color, depth = self._images(index)
         return Frame(index, float(self.times[index]), color, depth, self._pose(index))
 
     def timestamps(self) -> NDArray[np.float64]:
@@ -85,6 +76,19 @@ class FileSequence:
     def reference_mesh(self) -> Mesh | None:
         """The ground-truth surface, or None. Raises InputError when its file is unreadable."""
         return None if self.mesh_file is None else load_mesh(self.mesh_file)
+
+    def _images(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Colour [H, W, 3] and depth [H, W] of a frame. Raises FrameError."""
+        size = (self.intrinsics.width, self.intrinsics.height)
+        color: NDArray[Any] = read_color(self.color_files[index], self.color_size)
+        raw: NDArray[Any] = read_depth(self.depth_files[index], size)
+        if self.color_size != size:
+            color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+        if self.intrinsics.distortion:
+            fixed, fraction, rounded = self._undistortion
+            color = cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR)
+            raw = cv2.remap(raw, rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
+        return color, fill_pinholes(to_metres(raw, self.depth_scale))
 
     def _pose(self, index: int) -> NDArray[np.float64] | None:
         if self.poses is None or not np.isfinite(self.poses[index]).all():

@@ -52,7 +52,7 @@ class ImageHeader:
 
 def read_header(path: Path) -> ImageHeader:
     """The header of a PNG or JPEG file, from its first bytes. Raises FrameError."""
-    return _parse_header(path, _read_bytes(path, HEADER_BYTES))
+    return _parse_header(path, read_bytes(path, HEADER_BYTES))
 
 
 def read_color(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -70,13 +70,12 @@ def read_color(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
 
 def read_depth(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
     """A 16-bit grey PNG, values as stored, uint16 [H, W]. size: the (width, height) it must have. Raises FrameError."""
-    data, header = _read_checked(path, size)
-    if (header.kind, header.bits, header.channels) != ("PNG", 16, 1):
-        found = f"{header.bits}-bit {header.kind} with {header.channels} channels"
-        raise FrameError(
-            f"{path}: a {found}, but depth must be a 16-bit PNG with one; export it again without conversion"
-        )
-    return cast("NDArray[np.uint16]", _decode(path, data, cv2.IMREAD_UNCHANGED, (size[1], size[0]), np.uint16))
+    return cast("NDArray[np.uint16]", _read_grey(path, size, "depth", np.uint16))
+
+
+def read_levels(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """An 8-bit grey PNG, values as stored, uint8 [H, W]. size: the (width, height) it must have. Raises FrameError."""
+    return cast("NDArray[np.uint8]", _read_grey(path, size, "confidence", np.uint8))
 
 
 def to_metres(raw: NDArray[np.uint16], scale: float) -> NDArray[np.float32]:
@@ -99,10 +98,21 @@ def fill_pinholes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(filled, np.float32(0.5) * (far + near), depth)
 
 
+def _read_grey(path: Path, size: tuple[int, int], what: str, kind: type) -> NDArray[np.generic]:
+    data, header = _read_checked(path, size)
+    bits = 8 * np.dtype(kind).itemsize
+    if (header.kind, header.bits, header.channels) != ("PNG", bits, 1):
+        found = f"{header.bits}-bit {header.kind} with {header.channels} channels"
+        raise FrameError(
+            f"{path}: a {found}, but {what} must be a {bits}-bit PNG with one; export it again without conversion"
+        )
+    return _decode(path, data, cv2.IMREAD_UNCHANGED, (size[1], size[0]), kind)
+
+
 def _read_checked(path: Path, size: tuple[int, int]) -> tuple[bytes, ImageHeader]:
     """The bytes of a complete image of the wanted size, still encoded."""
     limit = (1 << 20) + 8 * size[0] * size[1]
-    data = _read_bytes(path, limit + 1)
+    data = read_bytes(path, limit + 1)
     header = _parse_header(path, data)
     if header.size != size:
         raise FrameError(f"{path}: {_by(header.size)} pixels, but this sequence has {_by(size)}; remove or replace it")
@@ -113,7 +123,8 @@ def _read_checked(path: Path, size: tuple[int, int]) -> tuple[bytes, ImageHeader
     return data, header
 
 
-def _read_bytes(path: Path, limit: int) -> bytes:
+def read_bytes(path: Path, limit: int) -> bytes:
+    """The first ``limit`` bytes of a file that is not empty. Raises FrameError."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise FrameError(f"{path}: not a regular file; replace it by an image")

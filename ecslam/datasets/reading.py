@@ -61,9 +61,9 @@ def read_text(path: Path) -> str:
 
 
 def read_numbers(path: Path) -> NDArray[np.float64]:
-    """All numbers of a text file, flat; ``inf`` and ``nan`` are allowed. Raises InputError."""
+    """All numbers of a text file, flat; ``inf`` and ``nan`` are allowed, also as ``-nan(ind)``. Raises InputError."""
     try:
-        return np.array(read_text(path).replace(",", " ").split(), np.float64)
+        return np.array(read_text(path).replace(",", " ").replace("(ind)", "").split(), np.float64)
     except ValueError:
         raise InputError(f"{path}: holds something that is not a number; write plain numbers") from None
 
@@ -125,6 +125,15 @@ def same_size(color_files: list[Path], depth_files: list[Path]) -> tuple[int, in
             "this layout has both at one size, pixel on pixel: export them again, registered"
         )
     return depth
+
+
+def same_shape(color: tuple[int, int], depth: tuple[int, int], folder: Path) -> None:
+    """Raises InputError when images of these sizes (width, height) cannot show the same view."""
+    if abs(color[0] / color[1] - depth[0] / depth[1]) > 0.02:
+        raise InputError(
+            f"{folder}: colour ({color[0]}x{color[1]}) and depth ({depth[0]}x{depth[1]}) have different shapes and "
+            "cannot show the same view; export both again, uncropped"
+        )
 
 
 def finite_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:

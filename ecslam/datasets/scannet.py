@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..types import InputError
 from .files import FileSequence
 from .meshes import first_existing
-from .reading import common_size, has_numbered, numbered, paired, read_intrinsics, read_pose_files
+from .reading import common_size, has_numbered, numbered, paired, read_intrinsics, read_pose_files, same_shape
 
 COLOR = r"(\d{1,9})\.(?:jpg|png)"
 FRAMES_PER_S = 30.0
@@ -28,11 +27,7 @@ def open(path: Path) -> FileSequence:
     depth = numbered(root / "depth", r"(\d{1,9})\.png")
     numbers = paired(color, depth, root)
     color_size, size = common_size(list(color.values())), common_size(list(depth.values()))
-    if abs(color_size[0] / color_size[1] - size[0] / size[1]) > 0.02:
-        raise InputError(
-            f"{root}: colour ({color_size[0]}x{color_size[1]}) and depth ({size[0]}x{size[1]}) have different "
-            "shapes and cannot show the same view; export both again, uncropped"
-        )
+    same_shape(color_size, size, root)
     pose_files = numbered(root / "pose", r"(\d{1,9})\.txt")
     poses, notes = read_pose_files([pose_files.get(n) for n in numbers])
     meshes = (f / f"{scene.name}_vh_clean{end}.ply" for f in (root, scene) for end in ("", "_2"))
