@@ -17,10 +17,11 @@ from .types import Frame, Intrinsics
 LANDMARK_BYTES = 44
 KEPT, SOUGHT = 200, 500  # landmarks of a keyframe, and of a frame that is to be found
 CORNERS, CELLS = 1000, 10  # found, and then spread over so many cells a side
-PYRAMID, PATCH_PX, CONTRAST = (1.4, 4), 31, 12
+PYRAMID, PATCH_PX = (1.4, 4), 31
 ALIKE_BITS = 64  # of 256: descriptors farther apart show different things
 TRIPLES, REFINEMENTS = 300, 3
 NEAR_M, NEAR_PER_M = 0.02, 0.005  # two measurements of one point at a depth of z are within a + b z^2
+LOOSELY = 2  # so many times as far apart, since alignment and drift move a pose away from what its landmarks say
 TELLING = 100  # so many landmarks that know no other are somewhere else
 LEAST_AGREED, MOST_TRIED, MOST_FOUND = 10, 5, 2  # matches that make a pose; views that are tried, poses that are kept
 
@@ -39,7 +40,7 @@ class Landmarks:
 def find_landmarks(frame: Frame, camera: Intrinsics, config: Config, count: int) -> Landmarks:
     """The strongest corners with measured depth, ``count`` at most, spread over the image."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-    orb = cv2.ORB.create(CORNERS, *PYRAMID, PATCH_PX // 2 + 1, patchSize=PATCH_PX, fastThreshold=CONTRAST)
+    orb = cv2.ORB.create(CORNERS, *PYRAMID, PATCH_PX // 2 + 1, patchSize=PATCH_PX)
     corners = orb.detect(gray, None)
     place, depth = _measured(corners, frame, config)
     cell = (place * CELLS // frame.depth.shape[::-1]) @ (1, CELLS)
@@ -96,7 +97,7 @@ class Recognition:
     def allows(self, c2w: NDArray[np.float64]) -> bool:
         """Whether enough agrees at c2w [4, 4], or there is too little that could."""
         return not self._telling or any(
-            (_off(inverse(pose) @ c2w, here, there) < _near(here)).sum() >= LEAST_AGREED
+            (_off(inverse(pose) @ c2w, here, there) < LOOSELY * _near(here)).sum() >= LEAST_AGREED
             for here, there, pose in self._pairs
         )
 
