@@ -55,12 +55,15 @@ class Recovery:
     ) -> TrackResult:
         """The result to use for this frame, given the previous pose [4, 4]. ``elsewhere`` is asked only in need, which
         is also when the map explains the frame worse than is usual, and after a ``gap`` in time, a miss or a sudden
-        motion: it may have ended in a wrong place nearby."""
+        motion: it may have ended in a wrong place nearby. What then counts against it alone is that looks disagree, for
+        a sudden motion only where the fit is worse, too."""
         self.note = ""
-        sudden = gap or self.misses > 0 or not near(track.c2w, last, SUDDEN_M, SUDDEN_DEG)
-        trusted = not self.lost and self._plausible(track, last) and not (sudden and not elsewhere.agrees(track.c2w))
-        doubted = not trusted or track.fit < (DOUBT_SHARE * self.usual_fit or DOUBT_FIT)
-        if doubted or sudden:
+        worse = track.fit < (DOUBT_SHARE * self.usual_fit or DOUBT_FIT)
+        sudden = not near(track.c2w, last, SUDDEN_M, SUDDEN_DEG)
+        adrift = gap or self.misses > 0 or (sudden and worse)
+        trusted = not self.lost and self._plausible(track, last) and not (adrift and not elsewhere.agrees(track.c2w))
+        doubted = not trusted or worse
+        if doubted or sudden or adrift:
             least = max(FOUND_FIT, FOUND_SHARE * self.usual_fit, track.fit if trusted else 0.0)
             tried = (way() for way in (elsewhere.recognised, elsewhere.searched)[: 1 + doubted])
             found = next((r for r in tried if r is not None and r.fit >= least and elsewhere.agrees(r.c2w)), None)

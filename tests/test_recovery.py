@@ -129,15 +129,18 @@ def test_a_place_that_fits_but_looks_otherwise_is_not_taken(lost):
 
 def test_a_sudden_motion_or_a_gap_is_trusted_where_the_looks_agree():
     sudden = pose(centre=(0.2, 0, 0))
-    for gap, c2w in ((False, sudden), (True, HERE)):
+    for gap, fit, c2w in ((False, 0.7, sudden), (True, 0.9, HERE)):
         for agrees in (True, False):
             recovery, places = usual(), Places(agrees=lambda c2w, answer=agrees: answer)
-            recovery.judge(result(0.9, c2w), HERE, places, gap)
+            recovery.judge(result(fit, c2w), HERE, places, gap)
             assert recovery.missed == (not agrees)
-            assert places.asked == ["recognised", "searched"][: 1 + recovery.missed]
+            assert places.asked == ["recognised", "searched"][: 2 if fit < 0.8 or not agrees else 1]
+    recovery = usual()
+    recovery.judge(result(0.9, sudden), HERE, Places(agrees=lambda c2w: False))
+    assert not recovery.missed
     recovery = usual()
     for _ in range(2):  # nor is a good fit near a pose that was held
-        recovery.judge(result(0.9, sudden), HERE, Places(agrees=lambda c2w: False))
+        recovery.judge(result(0.7, sudden), HERE, Places(agrees=lambda c2w: False))
         recovery.judge(result(0.9), HERE, Places(agrees=lambda c2w: False))
         assert recovery.missed
     recovery = usual()
