@@ -13,14 +13,14 @@ from .config import Config
 from .field import TsdfField
 from .kernels import Backend
 from .kernels.graphs import Recorder
-from .keyframes import Keyframe, make_thumbnail, most_similar
+from .keyframes import Keyframe
 from .observed import ObservedVoxels
 from .observed_gpu import ObservedTable
-from .pixels import spread_pixels
-from .recovery import Recovery, around, best_start, relocalise
+from .recovery import Recovery, around, best_start
+from .relocalisation import Relocalisation
 from .samples import seeded
 from .saving import Arrays, part, prefixed
-from .tracker import LEAST_POINTS, HostTracker, Tracker, TrackResult
+from .tracker import HostTracker, Tracker, TrackResult
 from .trajectory import Trajectory
 from .types import Frame, Intrinsics
 from .volume import FusedVolume, create_volume
@@ -28,7 +28,6 @@ from .volume import FusedVolume, create_volume
 if TYPE_CHECKING:
     from .tracker_gpu import GpuTracker
 
-RELOCALISE_FROM = 5
 GAP_S = 1.0
 
 
@@ -76,7 +75,8 @@ class Follower:
         last, gap = trajectory[-1], frame.timestamp - trajectory.timestamps[-1] > GAP_S
         guess = last if self.recovery.lost or gap else trajectory.predict(frame.timestamp)
         track = best_start(lambda start: tracker.track(frame, start, field, config), around(guess) if gap else [guess])
-        return self.recovery.judge(track, last, lambda: self._find_again(frame, surface, trajectory, keyframes, config))
+        elsewhere = Relocalisation(frame, self._camera, surface, trajectory, keyframes, config, self._rng)
+        return self.recovery.judge(track, last, elsewhere, gap)
 
     def fuse(self, frame: Frame, c2w: NDArray[np.float64], config: Config) -> None:
         """Average a frame seen from c2w [4, 4] into the volume, where there is one."""
@@ -101,18 +101,6 @@ class Follower:
         surface = learned if self._volume is None else self._volume
         tracker = HostTracker(self._camera, surface, observed, kernels, self._rng, self._generator, self.recorder)
         return surface, tracker
-
-    def _find_again(
-        self, frame: Frame, surface: Surface, trajectory: Trajectory, keyframes: list[Keyframe], config: Config
-    ) -> TrackResult | None:
-        """Relocalisation from the last pose and the keyframes that look most alike; None where hardly anything is
-        measured."""
-        measured = spread_pixels(frame, self._camera, config.align.points, config, self._rng)
-        if len(measured.points()) < LEAST_POINTS:
-            return None
-        alike = most_similar(keyframes, make_thumbnail(frame.color), RELOCALISE_FROM)
-        starts = np.stack([trajectory[-1], *trajectory.keyframe_poses()[alike]])
-        return relocalise(surface, measured, starts, config, np.random.default_rng([config.seed, frame.index]))
 
     def state(self) -> Arrays:
         """What ``load`` needs, as arrays nobody writes to afterwards."""

@@ -1,4 +1,5 @@
-"""The stored pixels of each keyframe: a few percent of the image, in camera coordinates (poses live in Trajectory)."""
+"""What is stored of each keyframe, in camera coordinates (poses live in Trajectory): a few percent of the image, and
+what it is known again by."""
 
 from __future__ import annotations
 
@@ -9,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config
+from .landmarks import KEPT, LANDMARK_BYTES, Landmarks, find_landmarks
 from .pixels import Pixels, choose_pixels
 from .types import Frame, Intrinsics
 
 THUMBNAIL = (40, 30)
 THUMBNAIL_BYTES = 4 * THUMBNAIL[0] * THUMBNAIL[1]
-PIXEL_BYTES = 16
+HEAD_BYTES, PIXEL_BYTES = 4, 16
 BLOCK, ALIGNMENT = 32 << 20, 64  # bytes; the end of a block takes no memory before it is written to
 
 
@@ -22,26 +24,29 @@ BLOCK, ALIGNMENT = 32 << 20, 64  # bytes; the end of a block takes no memory bef
 class Keyframe:
     """One keyframe in one piece of memory, so that a thousand of them cost nothing but their pixels.
 
-    frame: index in the sequence. record: uint8 [bytes], the thumbnail and then the arrays of the pixels.
+    frame: index in the sequence. record: uint8 [bytes]: how many landmarks there are (int32), the thumbnail, the arrays
+    of the landmarks and those of the pixels.
     """
 
     frame: int
     record: NDArray[np.uint8]
 
     @classmethod
-    def of(cls, frame: int, pixels: Pixels, thumbnail: NDArray[np.float32]) -> Keyframe:
+    def of(cls, frame: int, pixels: Pixels, thumbnail: NDArray[np.float32], landmarks: Landmarks) -> Keyframe:
         """A keyframe with copies of these arrays."""
-        parts = (thumbnail, pixels.direction, pixels.depth, pixels.color, pixels.feature)
+        head = np.array([len(landmarks)], np.int32)
+        known = (head, thumbnail, landmarks.points, landmarks.descriptors)
+        parts = (*known, pixels.direction, pixels.depth, pixels.color, pixels.feature)
         return cls(frame, np.concatenate([part.ravel().view(np.uint8) for part in parts]))
 
     def __len__(self) -> int:
         """How many pixels are stored."""
-        return (len(self.record) - THUMBNAIL_BYTES) // PIXEL_BYTES
+        return (len(self.record) - self._pixels_from) // PIXEL_BYTES
 
     @property
     def pixels(self) -> Pixels:
         """The stored pixels, views of ``record``."""
-        n, stored = len(self), self.record[THUMBNAIL_BYTES:]
+        n, stored = len(self), self.record[self._pixels_from :]
         return Pixels(
             stored[: 8 * n].view(np.float32).reshape(n, 2),
             stored[8 * n : 12 * n].view(np.float32),
@@ -50,9 +55,23 @@ class Keyframe:
         )
 
     @property
+    def landmarks(self) -> Landmarks:
+        """The stored landmarks, views of ``record``."""
+        n, stored = self._landmarks, self.record[HEAD_BYTES + THUMBNAIL_BYTES : self._pixels_from]
+        return Landmarks(stored[: 12 * n].view(np.float32).reshape(n, 3), stored[12 * n :].reshape(n, 32))
+
+    @property
     def thumbnail(self) -> NDArray[np.float32]:
         """float32 [30 * 40], blurred luminance of zero mean and unit norm."""
-        return self.record[:THUMBNAIL_BYTES].view(np.float32)
+        return self.record[HEAD_BYTES : HEAD_BYTES + THUMBNAIL_BYTES].view(np.float32)
+
+    @property
+    def _landmarks(self) -> int:
+        return int(self.record[:HEAD_BYTES].view(np.int32)[0])
+
+    @property
+    def _pixels_from(self) -> int:
+        return HEAD_BYTES + THUMBNAIL_BYTES + LANDMARK_BYTES * self._landmarks
 
 
 class Shelf:
@@ -95,7 +114,8 @@ def make_keyframe(frame: Frame, camera: Intrinsics, config: Config) -> Keyframe:
     pixels = choose_pixels(frame, camera, count, config, rng, rim=config.mapping.rim)
     if not config.sampling.without_depth:
         pixels = pixels.take(np.flatnonzero(pixels.depth > 0))
-    return Keyframe.of(frame.index, pixels, make_thumbnail(frame.color))
+    landmarks = find_landmarks(frame, camera, config, KEPT)
+    return Keyframe.of(frame.index, pixels, make_thumbnail(frame.color), landmarks)
 
 
 def make_thumbnail(color: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -1,19 +1,17 @@
-"""Lost and found: notice within a few frames that the map no longer explains the images, and find the way back."""
+"""Lost and found: notice within a few frames that the map no longer explains the images, and when it does again."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .align import Surface
-from .config import Config
-from .pixels import Pixels
 from .se3 import retract, rotation_angle_deg
-from .tracker import TrackResult, track_direct
+from .tracker import TrackResult
 
 LOST_FIT = 0.25
 LOST_SHARE, FOUND_SHARE = 0.6, 0.92  # of the usual fit: a wrong place can be made to explain 85 % of it
@@ -23,10 +21,24 @@ FOUND_FIT = 0.6
 PATIENCE = 3
 MAX_STEP_M = 0.5
 MAX_TURN_DEG = 35.0
-SEARCH_POINTS, SEARCH_POSES, SEARCH_KEPT, SEARCH_FOUND, SEARCH_ROUNDS = 300, 600, 30, 3, 5
-SEARCH_M, SEARCH_RAD = 0.2, 0.25
+SUDDEN_M, SUDDEN_DEG = 0.1, 6.0  # since the frame before: so far, alignment often ends in a wrong place
 AROUND_M, AROUND_RAD = 0.1, 0.1
-RELOCALISE_KERNELS_M, RELOCALISE_ITERATIONS = (0.2, 0.06, 0.02), 20
+
+
+class Elsewhere(Protocol):
+    """Where else a frame may have been seen from, worked out when it is asked for."""
+
+    def recognised(self) -> TrackResult | None:
+        """From a place that looks the same; None where none does."""
+        ...
+
+    def searched(self) -> TrackResult | None:
+        """From where the shapes fit; None where there is no use in looking for it."""
+        ...
+
+    def agrees(self, c2w: NDArray[np.float64]) -> bool:
+        """Whether what the frame looks like allows it to have been seen from c2w [4, 4]."""
+        ...
 
 
 class Recovery:
@@ -39,16 +51,24 @@ class Recovery:
         self.usual_fit = 0.0
 
     def judge(
-        self, track: TrackResult, last: NDArray[np.float64], relocalise: Callable[[], TrackResult | None]
+        self, track: TrackResult, last: NDArray[np.float64], elsewhere: Elsewhere, gap: bool = False
     ) -> TrackResult:
-        """The result to use for this frame, given the previous pose [4, 4]; ``relocalise`` is asked only in need, and
-        when the map explains the frame worse than is usual: a fast motion may have ended in a wrong place nearby."""
+        """The result to use for this frame, given the previous pose [4, 4]. ``elsewhere`` is asked only in need, which
+        is also when the map explains the frame worse than is usual, and after a ``gap`` in time, a miss or a sudden
+        motion: it may have ended in a wrong place nearby. What then counts against it alone is that looks disagree, for
+        a sudden motion only where the fit is worse, too."""
         self.note = ""
-        trusted = not self.lost and self._plausible(track, last)
-        if not trusted or track.fit < (DOUBT_SHARE * self.usual_fit or DOUBT_FIT):
-            found, known = relocalise(), track.fit if trusted else 0.0
-            if found is not None and found.fit >= max(FOUND_FIT, FOUND_SHARE * self.usual_fit, known):
-                self.note = "relocalised" if self.lost else "recovered"
+        worse = track.fit < (DOUBT_SHARE * self.usual_fit or DOUBT_FIT)
+        sudden = not near(track.c2w, last, SUDDEN_M, SUDDEN_DEG)
+        adrift = gap or self.misses > 0 or (sudden and worse)
+        trusted = not self.lost and self._plausible(track, last) and not (adrift and not elsewhere.agrees(track.c2w))
+        doubted = not trusted or worse
+        if doubted or sudden or adrift:
+            least = max(FOUND_FIT, FOUND_SHARE * self.usual_fit, track.fit if trusted else 0.0)
+            tried = (way() for way in (elsewhere.recognised, elsewhere.searched)[: 1 + doubted])
+            found = next((r for r in tried if r is not None and r.fit >= least and elsewhere.agrees(r.c2w)), None)
+            if found is not None:
+                self.note = "relocalised" if self.lost else "recovered" if doubted else ""
                 track, trusted = found, True
         if trusted:
             self.usual_fit += (track.fit - self.usual_fit) / USUAL_OVER if self.usual_fit else track.fit
@@ -63,8 +83,7 @@ class Recovery:
     def _plausible(self, track: TrackResult, last: NDArray[np.float64]) -> bool:
         if not np.isfinite(track.c2w).all() or track.fit < max(LOST_FIT, LOST_SHARE * self.usual_fit):
             return False
-        step = float(np.linalg.norm(track.c2w[:3, 3] - last[:3, 3]))
-        return step < MAX_STEP_M and float(rotation_angle_deg(last, track.c2w)) < MAX_TURN_DEG
+        return near(track.c2w, last, MAX_STEP_M, MAX_TURN_DEG)
 
     def state(self) -> NDArray[np.float64]:
         """Three numbers, for a checkpoint."""
@@ -74,6 +93,11 @@ class Recovery:
         """Go on from what ``state`` gave."""
         lost, misses, usual_fit = state
         self.lost, self.misses, self.usual_fit = bool(lost), int(misses), float(usual_fit)
+
+
+def near(a: NDArray[np.float64], b: NDArray[np.float64], metres: float, degrees: float) -> bool:
+    """Whether two poses [4, 4] are less than this apart."""
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])) < metres and float(rotation_angle_deg(a, b)) < degrees
 
 
 def around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -88,44 +112,3 @@ def best_start(
 ) -> TrackResult:
     """Track from every start pose [4, 4] and keep the result that the map explains best."""
     return max((track(start) for start in starts), key=lambda result: result.fit)
-
-
-def relocalise(
-    surface: Surface, measured: Pixels, starts: NDArray[np.float64], config: Config, rng: np.random.Generator
-) -> TrackResult:
-    """Direct alignment with a wide basin from ``starts`` [S, 4, 4] and the poses that a search around these finds."""
-    align = replace(config.align, kernels_m=RELOCALISE_KERNELS_M, iterations=RELOCALISE_ITERATIONS)
-    found = search(surface, measured.points(), starts, config.truncation_m, rng)
-    wide = replace(config, align=align)
-    return best_start(lambda start: track_direct(surface, measured, start, wide), [*starts, *found])
-
-
-def search(
-    surface: Surface,
-    points: NDArray[np.float32],
-    starts: NDArray[np.float64],
-    truncation_m: float,
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
-    """The few poses [k, 4, 4] around ``starts`` [S, 4, 4] that bring measured points [N, 3], in camera coordinates,
-    nearest to the known surface: random ones, then nearer and nearer around the best (the cross-entropy method)."""
-    points = points[:: max(1, len(points) // SEARCH_POINTS)]
-    best = starts[np.arange(SEARCH_POSES) % len(starts)]
-    spread = np.array([SEARCH_M] * 3 + [SEARCH_RAD] * 3)
-    for _ in range(SEARCH_ROUNDS):
-        moves = torch.from_numpy(rng.normal(size=(len(best), 6)) * spread)
-        poses = np.concatenate([best, retract(torch.from_numpy(best), moves).numpy()])
-        ranked = poses[np.argsort(-_nearness(surface, points, poses, truncation_m), kind="stable")]
-        best = ranked[np.arange(SEARCH_POSES) % SEARCH_KEPT]
-        spread = spread / 2
-    return ranked[:SEARCH_FOUND]
-
-
-def _nearness(
-    surface: Surface, points: NDArray[np.float32], poses: NDArray[np.float64], truncation_m: float
-) -> NDArray[np.float64]:
-    """[P] mean over the points of 1 on the surface, falling to 0 at ``truncation_m`` and where nothing is known."""
-    world = np.einsum("pij,nj->pni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
-    distance, known = surface.distances(world.reshape(-1, 3))
-    near = np.where(known, np.maximum(0.0, 1 - np.abs(distance) / truncation_m), 0.0)
-    return np.asarray(near.reshape(len(poses), -1).mean(1))

@@ -26,6 +26,17 @@ def orthonormalise(c2w: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
+def best_motion(source: NDArray[np.floating], target: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The motions [..., 4, 4] that bring points [..., N, 3] closest to others in least squares; N >= 1."""
+    middle, goal = source.mean(-2), target.mean(-2)
+    motion = np.zeros((*source.shape[:-2], 4, 4))
+    motion[..., :3, :3] = np.swapaxes(target - goal[..., None, :], -1, -2) @ (source - middle[..., None, :])
+    motion = orthonormalise(motion)
+    motion[..., :3, 3] = goal - (motion[..., :3, :3] @ middle[..., None])[..., 0]
+    motion[..., 3, 3] = 1
+    return motion
+
+
 def rotation_angle_deg(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angle in degrees between the rotations of poses [..., 4, 4]."""
     r = np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]

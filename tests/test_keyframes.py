@@ -7,7 +7,11 @@ import numpy as np
 from ecslam.config import Config
 from ecslam.datasets import open_sequence
 from ecslam.keyframes import Keyframe, Shelf, make_keyframe, make_thumbnail, most_similar, surface_points
+from ecslam.landmarks import KEPT, LANDMARK_BYTES, Landmarks
 from ecslam.pixels import Pixels
+from ecslam.saving import pack_keyframes, unpack_keyframes
+
+NONE = Landmarks(np.empty((0, 3), np.float32), np.empty((0, 32), np.uint8))
 
 
 def flat(count):
@@ -25,6 +29,7 @@ def test_a_shelf_keeps_keyframes_as_they_are_side_by_side():
         assert before.frame == after.frame
         arrays = [(before.thumbnail, after.thumbnail)]
         arrays += [(getattr(before.pixels, f.name), getattr(after.pixels, f.name)) for f in fields(Pixels)]
+        arrays += [(getattr(before.landmarks, f.name), getattr(after.landmarks, f.name)) for f in fields(Landmarks)]
         for old, new in arrays:
             assert old.dtype == new.dtype
             np.testing.assert_array_equal(old, new)
@@ -40,10 +45,21 @@ def test_a_shelf_takes_what_is_larger_than_its_blocks_and_what_is_empty():
     shelf = Shelf()
     for count in (0, 2 << 20, 3):
         pixels = flat(count)
-        kept = shelf.keep(Keyframe.of(0, pixels, np.full(1200, 7, np.float32)))
+        kept = shelf.keep(Keyframe.of(0, pixels, np.full(1200, 7, np.float32), NONE))
         assert len(kept.pixels) == count
         assert kept.pixels.depth.sum() == count
         assert (kept.thumbnail == 7).all()
+
+
+def test_what_a_keyframe_is_known_by_goes_into_a_checkpoint_and_back():
+    room = open_sequence("synthetic/studio?size=160x120&frames=3")
+    made = make_keyframe(room[0], room.intrinsics, Config())
+    assert KEPT * LANDMARK_BYTES < 10_000
+    assert len(made.landmarks) == KEPT
+    (back,) = unpack_keyframes(pack_keyframes([made]))
+    np.testing.assert_array_equal(back.landmarks.points, made.landmarks.points)
+    np.testing.assert_array_equal(back.landmarks.descriptors, made.landmarks.descriptors)
+    assert len(back) == len(made.pixels)
 
 
 def picture(seed):
@@ -52,7 +68,7 @@ def picture(seed):
 
 
 def test_a_picture_is_most_similar_to_itself_however_bright_it_is():
-    kept = [Keyframe.of(k, flat(3), make_thumbnail(picture(k))) for k in range(6)]
+    kept = [Keyframe.of(k, flat(3), make_thumbnail(picture(k)), NONE) for k in range(6)]
     for k in range(6):
         brighter = make_thumbnail((1.5 * picture(k) + 20).astype(np.uint8))
         assert abs(brighter.mean()) < 1e-6
@@ -66,7 +82,7 @@ def test_a_picture_is_most_similar_to_itself_however_bright_it_is():
 
 
 def test_surface_points_are_thinned_to_the_limit_and_lie_where_their_cameras_saw_them():
-    kept = [Keyframe.of(k, flat(1000), np.zeros(1200, np.float32)) for k in range(3)]
+    kept = [Keyframe.of(k, flat(1000), np.zeros(1200, np.float32), NONE) for k in range(3)]
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = 10, 20, 30
     assert len(surface_points(kept, poses, 10_000)) == 3000

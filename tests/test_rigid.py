@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ecslam.rigid import orthonormalise, quaternions, rotations
+from ecslam.rigid import best_motion, orthonormalise, quaternions, rotations
 
 HALF_TURNS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -2, 3], [-1, 2, 2]])
 
@@ -41,3 +41,13 @@ def test_the_nearest_rigid_motion_never_mirrors():
     bent = np.tile(np.eye(4), (2, 1, 1))
     bent[:, :3, :3] = turn @ np.diag([1, 1, -0.1]), turn @ np.diag([1.1, 0.9, 0.2])
     assert np.allclose(orthonormalise(bent)[:, :3, :3], turn)
+
+
+def test_the_best_motion_is_that_of_scipy_for_each_of_many_and_never_a_reflection():
+    rng = np.random.default_rng(0)
+    source, target = rng.normal(size=(2, 5, 4, 3))
+    for found, a, b in zip(best_motion(source, target), source, target, strict=True):
+        turn, _ = Rotation.align_vectors(b - b.mean(0), a - a.mean(0))
+        assert np.allclose(found[:3, :3], turn.as_matrix())
+        assert np.allclose(found[:3, :3] @ a.mean(0) + found[:3, 3], b.mean(0))
+        assert found[3].tolist() == [0, 0, 0, 1]

@@ -192,6 +192,17 @@ def test_a_camera_that_comes_back_elsewhere_than_it_was_lost_is_found():
     assert error_cm(slam, 30) < 3
 
 
+def test_a_camera_that_comes_back_where_half_of_what_it_sees_is_new_is_recognised():
+    slam = engine(live("mapping.iterations=2"))
+    walk(slam, list(range(30)))
+    walk(slam, [29] * 3, blind)
+    (back,) = walk(slam, [64])  # 75 cm from the nearest frame seen
+    assert back.note == "relocalised"
+    assert error_cm(slam, 64) < 3
+    (away,) = walk(slam, [FAR])
+    assert not away.tracked
+
+
 def test_a_fixed_box_that_is_too_small_is_said_with_the_share_of_rays_outside():
     slam = engine(live("mapping.first_iterations=1", "field.box=[2, 0, 0, 4, 6, 3]"))
     reports = walk(slam, list(range(11)))
