@@ -1,5 +1,8 @@
 """The renderer of the synthetic rooms: exact depth, view-independent colour, the same bytes every time."""
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -176,3 +179,19 @@ def test_place_turns_before_it_moves():
     (shape,) = place([block((0, 0, 0), (2, 1, 1), Paint())], 5, 6, 0, 90)
     assert_allclose(shape.center, [4.5, 7, 0.5], atol=1e-12)
     assert_allclose(shape.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.slow
+def test_what_is_compiled_and_what_is_read_back_from_disk_draw_the_same(tmp_path):
+    script = (
+        "import hashlib; from ecslam.datasets import open_sequence; "
+        "frame = open_sequence('synthetic/studio?frames=8&size=320x240')[0]; "
+        "print(hashlib.sha256(frame.depth.tobytes() + frame.color.tobytes()).hexdigest())"
+    )
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert len(first.strip()) == 64
+    assert first == second

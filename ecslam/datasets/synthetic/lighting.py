@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...compiled import drop_stale
 from .scene import ALBEDO, GLOW, LIGHT_SIZE, LIGHT_START, Scene
 from .shapes import BOX, Light
-from .solids import FAR, FAST, ONE, ZERO, F, enter, lean, normal, scalar
+from .solids import FAR, FAST, ONE, ZERO, F, enter, lean_entry, normal, scalar
 from .surface import at, face_of, irradiance, solid
 from .tracing import build, buried, to_local, trace
 from .workers import spread
@@ -147,7 +147,7 @@ def _scatter(m, sample):
     return F(a - math.floor(a)), F(b - math.floor(b)), F(c - math.floor(c))
 
 
-@lean
+@lean_entry
 def _direct(numbers, values, box, skip, leaf, local, point, up, nodes, lamps, out):
     """Add to out [M, 3] the irradiance straight from the lights at some nodes."""
     for m in nodes:
@@ -178,7 +178,7 @@ def _direct(numbers, values, box, skip, leaf, local, point, up, nodes, lamps, ou
     return out
 
 
-@lean
+@lean_entry
 def _gather(numbers, values, box, skip, leaf, local, point, up, nodes, light, rays, out):
     """Write to out [M, 3] the irradiance that arrives at some nodes from other surfaces lit by ``light``."""
     for m in nodes:

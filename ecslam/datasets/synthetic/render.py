@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...types import Intrinsics
 from .scene import HALF, KIND, Scene
 from .shapes import BOX
-from .solids import FAR, FAST, ONE, ZERO, F, enter, lean, normal, scalar
+from .solids import FAR, FAST, ONE, ZERO, F, enter, normal, scalar
 from .surface import at, face_of, finish, shade, solid
 from .workers import spread
 
@@ -114,7 +114,7 @@ def _line(rays, k, v):
     )
 
 
-@lean
+@scalar
 def _box_row(z, ids, y, k, left, x0, x1, ax, ay, az, cx, cy, cz, ox, oy, oz, hx, hy, hz):
     """Intersect one row of rays with a box; no branches, so that it runs in vector registers."""
     lx, ly, lz, rx, ry, rz = -hx - ox, -hy - oy, -hz - oz, hx - ox, hy - oy, hz - oz
@@ -129,7 +129,7 @@ def _box_row(z, ids, y, k, left, x0, x1, ax, ay, az, cx, cy, cz, ox, oy, oz, hx,
         ids[y, x] = k if closer else ids[y, x]
 
 
-@lean
+@scalar
 def _curved_row(kind, extra, z, ids, y, k, left, x0, x1, ax, ay, az, cx, cy, cz, ox, oy, oz, hx, hy, hz):
     for x in range(x0, x1):
         u = F(left + x)
@@ -147,7 +147,7 @@ def _depth_band(numbers, values, rays, boxes, order, nears, depth, keys, top):
         _tile(numbers, values, rays, boxes, order, nears, depth, keys, top, left, z, ids)
 
 
-@lean
+@scalar
 def _tile(numbers, values, rays, boxes, order, nears, depth, keys, top, left, z, ids):
     rows, columns = min(BAND, depth.shape[0] - top), min(TILE, depth.shape[1] - left)
     z[:], ids[:] = FAR, -1
@@ -179,7 +179,7 @@ def _tile(numbers, values, rays, boxes, order, nears, depth, keys, top, left, z,
                 keys[top + y, left + x] = 8 * k + face
 
 
-@lean
+@scalar
 def _farthest(z, rows, columns):
     out = ZERO
     for y in range(rows):

@@ -19,10 +19,12 @@ TINY = F(1e-20)
 FAST = {"nsz", "arcp", "contract", "reassoc"}
 
 # Compiled without reference counts on the arrays passed in, which would be atomic and shared by all threads; such
-# functions cannot allocate.
-_LEAN = {"fastmath": FAST, "error_model": "numpy", "cache": True, "nogil": True, "_nrt": False}
+# functions cannot allocate. What is not inlined is compiled for itself and with each caller, and need not round alike:
+# which one runs depends on whether the caller was read from disk. So what makes pictures is inlined throughout.
+_LEAN = {"fastmath": FAST, "error_model": "numpy", "nogil": True, "_nrt": False}
 scalar = njit(forceinline=True, **_LEAN)
 lean = njit(**_LEAN)
+lean_entry = njit(cache=True, **_LEAN)
 
 
 @scalar
