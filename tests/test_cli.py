@@ -441,6 +441,7 @@ def test_what_is_missing_is_named(words):
     assert re.search("missing argument|requires an argument", outcome.err, re.I), outcome.err
 
 
+@pytest.mark.slow
 def test_a_run_whose_sequence_has_moved_goes_on_where_it_is_now(sequence, tmp_path):
     words = run_words(shutil.copytree(sequence, tmp_path / "room"), tmp_path / "run")
     assert ecslam(*words, "--frames", "0:3").code == 0
@@ -453,6 +454,7 @@ def test_a_run_whose_sequence_has_moved_goes_on_where_it_is_now(sequence, tmp_pa
     assert json.loads((tmp_path / "run" / "run.json").read_text())["sequence"] == str(tmp_path / "elsewhere")
 
 
+@pytest.mark.slow
 def test_a_run_can_be_judged_from_another_folder(sequence, tmp_path, monkeypatch):
     monkeypatch.chdir(sequence.parent)
     assert ecslam(*run_words(Path(sequence.name), tmp_path / "run"), "--frames", "0:2").code == 0

@@ -305,6 +305,7 @@ def test_depth_beyond_a_phones_reach_is_left_out() -> None:
     assert for_layout(load_preset("live"), "stray").depth_far_m == 5.0
 
 
+@pytest.mark.slow
 def test_a_room_recorded_by_a_phone_is_tracked_about_as_well_as_the_room_itself(tmp_path: Path) -> None:
     fine, coarse, itself = (
         open_sequence(f"synthetic/studio?size={size}&frames=12") for size in ("640x480", "160x120", "320x240")

@@ -137,6 +137,7 @@ def test_renders_the_same_bytes_from_any_thread():
         assert_array_equal(a.c2w_gt, b.c2w_gt)
 
 
+@pytest.mark.slow
 def test_tracing_agrees_with_sphere_tracing():
     shapes = solids()
     scene = pack(shapes)

@@ -129,6 +129,7 @@ def test_mesh_has_no_gaps_where_surfaces_meet(name):
     assert np.concatenate(wrong).mean() < 5e-4
 
 
+@pytest.mark.slow
 def test_mesh_faces_look_out_of_solids_into_the_room():
     mesh, shapes = open_synthetic("studio").reference_mesh(), room("studio").shapes
     corner = mesh.vertices[np.random.default_rng(1).permutation(mesh.faces)[:1500]].astype(np.float64)
