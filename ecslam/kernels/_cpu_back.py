@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ._cpu_field import corners, locate
+from ._cpu_field import MASK, OFFSET, corners, locate
 from ._cpu_math import BOTH, HALF, INNER, eight_sums
 from ._cpu_simd import (
+    fetch_add,
     isplat,
     lanes,
     load,
@@ -154,6 +155,16 @@ def add_sums(target, at, sums):
         for half in range(2):
             place = at + row * BOTH + 8 * half
             store(target, place, load(target, place) + sums[2 * row + half])
+
+
+@njit(**INNER)
+def next_level(counter, grid, d_table):
+    """Take the next level, the finest first, and clear its rows of the table's gradient; below 0 when none is left."""
+    level = grid.levels.shape[0] - 1 - fetch_add(counter, 0)
+    if level >= 0:
+        start = 2 * grid.levels[level, OFFSET]
+        d_table[start : start + 2 * grid.levels[level, MASK] + 2] = 0
+    return level
 
 
 @njit(**INNER)

@@ -252,6 +252,14 @@ def mix(v, fx, fy, fz):
 
 
 @njit(**INNER)
+def at_corners(table, rows):
+    """Both features at the corners of eight cells, eight vectors each, from their ``rows`` [64]."""
+    a, b, c, d = gather(table, rows, 0), gather(table, rows, 8), gather(table, rows, 16), gather(table, rows, 24)
+    e, f, g, h = gather(table, rows, 32), gather(table, rows, 40), gather(table, rows, 48), gather(table, rows, 56)
+    return (a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0]), (a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1])
+
+
+@njit(**INNER)
 def encode(grid, table, s, n, pitch, padded, want_jac):
     """Hash features of the points in ``s.x`` (paper, equation 1) and, if wanted, their derivatives."""
     rows = s.rows
@@ -260,20 +268,9 @@ def encode(grid, table, s, n, pitch, padded, want_jac):
         for p in range(0, n, 8):
             x, y, z, fx, fy, fz = locate(grid, level, s.x, p, pitch)
             corners(grid.levels, level, x, y, z, rows)
-            a, b, c, d = (
-                gather(table, rows, 0),
-                gather(table, rows, 8),
-                gather(table, rows, 16),
-                gather(table, rows, 24),
-            )
-            e, f, g, h = (
-                gather(table, rows, 32),
-                gather(table, rows, 40),
-                gather(table, rows, 48),
-                gather(table, rows, 56),
-            )
-            v0, x0, y0, z0 = mix((a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0]), fx, fy, fz)
-            v1, x1, y1, z1 = mix((a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1]), fx, fy, fz)
+            first, second = at_corners(table, rows)
+            v0, x0, y0, z0 = mix(first, fx, fy, fz)
+            v1, x1, y1, z1 = mix(second, fx, fy, fz)
             at = 2 * level * pitch + p
             store(s.enc, at, v0)
             store(s.enc, at + pitch, v1)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ._cpu_back import table_back
-from ._cpu_field import ANCHOR, MASK, OFFSET, corners, locate, mix
+from ._cpu_back import next_level, table_back
+from ._cpu_field import ANCHOR, at_corners, corners, locate, mix
 from ._cpu_math import INNER, OUTER
-from ._cpu_simd import fetch_add, store
-from ._cpu_table import gather
+from ._cpu_simd import store
 
 
 @njit(**INNER)
@@ -18,11 +17,9 @@ def level_features(grid, level, table, x, n, rows, feature):
     for p in range(0, n, 8):
         ix, iy, iz, fx, fy, fz = locate(grid, level, x, p, n)
         corners(grid.levels, level, ix, iy, iz, rows)
-        a, b, c, d = gather(table, rows, 0), gather(table, rows, 8), gather(table, rows, 16), gather(table, rows, 24)
-        e, f, g, h = gather(table, rows, 32), gather(table, rows, 40), gather(table, rows, 48), gather(table, rows, 56)
-        for k in range(2):
-            v = mix((a[k], b[k], c[k], d[k], e[k], f[k], g[k], h[k]), fx, fy, fz)
-            store(feature, k * n + p, v[0])
+        first, second = at_corners(table, rows)
+        store(feature, p, mix(first, fx, fy, fz)[0])
+        store(feature, n + p, mix(second, fx, fy, fz)[0])
 
 
 @njit(**INNER)
@@ -53,15 +50,13 @@ def from_anchor(grid, points, x):
 @njit(**OUTER)
 def smooth_worker(t, counter, scratch, grid, table, x, side, d_table):
     """Gradient of the whole table; scratch: float32 [threads, 4 n]."""
-    n, levels = x.shape[0] // 6, grid.levels.shape[0]
+    n = x.shape[0] // 6
     feature, d_feature = scratch[t, : 2 * n], scratch[t, 2 * n :]
     rows, parts = np.empty(192, np.int32), np.empty(24, np.float32)
     while True:
-        level = levels - 1 - fetch_add(counter, 0)
+        level = next_level(counter, grid, d_table)
         if level < 0:
             break
-        start = 2 * grid.levels[level, OFFSET]
-        d_table[start : start + 2 * grid.levels[level, MASK] + 2] = 0
         level_features(grid, level, table, x, n, rows, feature)
         d_feature[:] = 0
         for k in range(2):

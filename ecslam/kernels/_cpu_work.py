@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ._cpu_back import features_back, hidden_back, points_back, table_back, weights_back
-from ._cpu_field import BLOCK, MASK, OFFSET, carve, forward
+from ._cpu_back import features_back, hidden_back, next_level, points_back, table_back, weights_back
+from ._cpu_field import BLOCK, carve, forward
 from ._cpu_math import BOTH, HALF, INNER, OUTER
 from ._cpu_rays import compare, composite, pose_sums, rendered, sample_points
 from ._cpu_simd import fetch_add
@@ -259,14 +259,11 @@ def table_worker(t, counter, kept, chunk_rays, grid, padded, total, samples, d_t
     """Gradient of the whole table from what ``step_loop`` kept: a level belongs to one thread at a time."""
     pitch = up_to_eight(chunk_rays * samples)
     chunks = (total + chunk_rays - 1) // chunk_rays
-    levels = grid.levels.shape[0]
     rows, parts = np.empty(192, np.int32), np.empty(24, np.float32)
     while True:
-        level = levels - 1 - fetch_add(counter, 0)
+        level = next_level(counter, grid, d_table)
         if level < 0:
             break
-        start = 2 * grid.levels[level, OFFSET]
-        d_table[start : start + 2 * grid.levels[level, MASK] + 2] = 0
         for chunk in range(chunks):
             n = up_to_eight(min(chunk_rays, total - chunk * chunk_rays) * samples)
             x, d_enc = kept[chunk, : 6 * pitch], kept[chunk, 6 * pitch :]
