@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config
+from .pixels import in_range
 from .rigid import best_motion, inverse
 from .types import Frame, Intrinsics
 
@@ -62,8 +63,7 @@ def _measured(
     """Where corners lie, [N, 2] pixels, and the depth [N] there, 0 where there is none to be used."""
     place = np.array([corner.pt for corner in corners], np.float64).reshape(-1, 2)
     column, row = np.rint(place).astype(np.int64).T
-    depth = frame.depth[row, column]
-    return place, np.where((depth >= config.depth_near_m) & (depth <= config.depth_far_m), depth, np.float32(0))
+    return place, in_range(frame.depth[row, column], config)
 
 
 def _spread(

@@ -139,9 +139,13 @@ def _read(
 ) -> Pixels:
     v, u = np.divmod(index, frame.depth.shape[1])
     direction = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], 1).astype(np.float32)
-    depth = frame.depth.reshape(-1)[index]
-    depth = np.where((depth >= config.depth_near_m) & (depth <= config.depth_far_m), depth, np.float32(0))
+    depth = in_range(frame.depth.reshape(-1)[index], config)
     return Pixels(direction, depth, frame.color.reshape(-1, 3)[index], feature)
+
+
+def in_range(depth: NDArray[np.float32], config: Config) -> NDArray[np.float32]:
+    """The same depths, 0 where they do not count."""
+    return np.where((depth >= config.depth_near_m) & (depth <= config.depth_far_m), depth, np.float32(0))
 
 
 def border_of(config: Config, height: int, width: int) -> int:
