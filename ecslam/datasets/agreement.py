@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..indices import evenly
 from ..types import Frame, FrameError, Intrinsics, Sequence
-from .reading import finite_poses
+from .reading import OPENGL, finite_poses
 
 PAIRS, FARTHEST = 8, 30  # pairs of frames looked at, and how many frames may lie between
 MOVED_M, TURNED_DEG = 0.1, 6.0  # either is enough
@@ -19,7 +19,6 @@ BETTER, WORTH, MUCH = 0.5, 0.005, 0.04  # Kinect recordings with their own poses
 NOWHERE = "by the ground truth, no two frames looked at saw the same"
 
 Poses = NDArray[np.float64]
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class Reading(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import FrameError
-from .images import HEADER_BYTES, read_bytes
+from .images import HEADER_BYTES, read_bytes, require_size
 
 
 def array_size(path: Path) -> tuple[int, int]:
@@ -21,10 +21,7 @@ def read_depth_array(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
     """uint16 [H, W], as stored. size: the (width, height) it must have. Raises FrameError."""
     data = read_bytes(path, HEADER_BYTES + 2 * size[0] * size[1])
     found, start = _header(path, data)
-    if found != size:
-        raise FrameError(
-            f"{path}: {found[0]}x{found[1]} pixels, but this sequence has {size[0]}x{size[1]}; remove or replace it"
-        )
+    require_size(path, found, size)
     if len(data) - start != 2 * size[0] * size[1]:
         raise FrameError(f"{path}: not as long as an array of its size; copy it again")
     return np.frombuffer(data, "<u2", offset=start).reshape(size[1], size[0])

@@ -114,13 +114,18 @@ def _read_checked(path: Path, size: tuple[int, int]) -> tuple[bytes, ImageHeader
     limit = (1 << 20) + 8 * size[0] * size[1]
     data = read_bytes(path, limit + 1)
     header = _parse_header(path, data)
-    if header.size != size:
-        raise FrameError(f"{path}: {_by(header.size)} pixels, but this sequence has {_by(size)}; remove or replace it")
+    require_size(path, header.size, size)
     if len(data) > limit:
         raise FrameError(f"{path}: over {limit >> 20} MiB, too much for {_by(size)} pixels; replace it")
     if LAST_BYTES[header.kind] not in data[-64:]:
         raise FrameError(f"{path}: truncated {header.kind} (no end marker); copy it again")
     return data, header
+
+
+def require_size(path: Path, found: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raises FrameError when an image of (width, height) ``found`` is not of the sequence's ``size``."""
+    if found != size:
+        raise FrameError(f"{path}: {_by(found)} pixels, but this sequence has {_by(size)}; remove or replace it")
 
 
 def read_bytes(path: Path, limit: int) -> bytes:

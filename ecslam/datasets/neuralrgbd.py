@@ -12,10 +12,18 @@ from pathlib import Path
 import numpy as np
 
 from ..types import InputError, Intrinsics
-from .agreement import OPENGL
 from .files import FileSequence
 from .meshes import first_existing
-from .reading import common_size, has_numbered, numbered, paired, read_numbers, read_pose_list, same_shape
+from .reading import (
+    OPENGL,
+    common_size,
+    has_numbered,
+    numbered,
+    paired,
+    read_numbers,
+    read_pose_list,
+    same_shape,
+)
 
 COLOR = r"img(\d{1,9})\.(?:png|jpg)"
 DEPTH_FOLDERS = ("depth_filtered", "depth_with_noise", "depth")

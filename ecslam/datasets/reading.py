@@ -17,6 +17,7 @@ from .images import read_header
 MAX_PIXELS = 64_000_000
 MAX_TEXT_BYTES = 64 << 20
 INTRINSICS_FILE = "camera-intrinsics.txt"
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from its camera axes to OpenCV's, or back
 
 
 def numbered(folder: Path, pattern: str) -> dict[int, Path]:
