@@ -65,7 +65,7 @@ class HostDraw:
         if not len(missing):
             return rays
         row, numbers = rays.pose.index_select(0, missing), jitter.index_select(0, missing)
-        few = make_rays(pixels.take(missing), row, c2w, self._box, self._config, numbers, missing=True)
+        few = make_rays(pixels.take(missing), row, c2w, self._box, self._kernels, self._config, numbers, missing=True)
         z = resampled(few, c2w, self._field, self._kernels, self._config.sampling, self._generator)
         rays.z.index_copy_(0, missing, z)
         return rays
@@ -79,7 +79,7 @@ class HostDraw:
         pixels = upload(chosen.take(order), c2w.device)
         jitter = uniform(self._generator, c2w.device, len(pixels.depth), s.uniform + s.near_depth)
         row = torch.from_numpy(np.tile(np.repeat(np.arange(len(counts)), counts), AHEAD)[order])
-        rays = make_rays(pixels, row, c2w, self._box, self._config, jitter, missing=False)
+        rays = make_rays(pixels, row, c2w, self._box, self._kernels, self._config, jitter, missing=False)
         parts = (slice(first, first + sum(counts)) for first in range(0, len(row), sum(counts)))
         return [(pixels.take(part), jitter[part], rays.take(part)) for part in parts]
 
@@ -120,7 +120,7 @@ class DeviceDraw:
         first, length = views.spans[row].unbind(1)
         pixels = views.pixels.take(first + torch.minimum((numbers[:, 0] * length).long(), length - 1))
         self._field, self._kernels = field, kernels
-        self._rays = make_rays(pixels, row, c2w, views.box, config, numbers[:, 1:count], views.missing)
+        self._rays = make_rays(pixels, row, c2w, views.box, kernels, config, numbers[:, 1:count], views.missing)
         self._follow = views.missing and s.uniform >= LEAST_UNIFORM
         if self._follow:
             self._thinned, self._jitter = thinned(self._rays.z, s), numbers[:, count:].contiguous()

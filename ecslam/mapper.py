@@ -17,12 +17,11 @@ from .field import TsdfField, grow_field, map_params, regrow
 from .field_adam import FieldAdam
 from .kernels import LOSS_NAMES, Backend, DevicePixels, FieldParams, Weights
 from .kernels.graphs import Recorder
-from .losses import smooth_lattice
 from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
 from .rays import kernel_weights
-from .samples import seeded, uniform
+from .samples import seeded, smooth_lattice, uniform
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
 
 MIN_BETA = 1.0

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config, LossWeights
-from .kernels import DevicePixels, RayBatch, Weights
+from .kernels import Backend, DevicePixels, RayBatch, Weights
 from .pixels import Pixels
-from .samples import ray_exit, sample_depths
+from .samples import ray_exit
 
 
 def upload(pixels: Pixels, device: torch.device) -> DevicePixels:
@@ -36,21 +36,28 @@ def gather(views: Sequence[Pixels], picks: Sequence[NDArray[np.int64]]) -> Pixel
 
 
 def make_rays(
-    pixels: DevicePixels, row: Tensor, c2w: Tensor, box: Tensor, config: Config, jitter: Tensor, missing: bool
+    pixels: DevicePixels,
+    row: Tensor,
+    c2w: Tensor,
+    box: Tensor,
+    kernels: Backend,
+    config: Config,
+    jitter: Tensor,
+    missing: bool,
 ) -> RayBatch:
     """Rays of ``pixels`` with their sample depths, never waiting for the device.
 
     row: [R] says which of the poses c2w [P, 4, 4] each ray belongs to. box: [2, 3] metres. jitter: [R, S] in 0..1.
     missing: whether some have no depth, and so end where they leave the box.
     """
-    far = torch.full_like(pixels.depth, config.depth_far_m)
+    s, far = config.sampling, torch.full_like(pixels.depth, config.depth_far_m)
     if missing:
         poses = c2w.to(far).index_select(0, row)
         world = (poses[:, :3, :3] @ pixels.direction[:, :, None])[:, :, 0]
         far = ray_exit(poses[:, :3, 3], world, box, config.depth_far_m)
     return RayBatch(
         direction=pixels.direction,
-        z=sample_depths(pixels.depth, far, config.sampling, jitter),
+        z=kernels.sample_depths(pixels.depth, far, jitter, s.uniform, s.near_m, s.depth_range_m),
         depth=pixels.depth,
         color=_fractions(pixels.color),
         feature=pixels.feature,

@@ -97,7 +97,7 @@ def track_adam(
     c2w = torch.from_numpy(guess)[None].to(device)
     row, missing = torch.zeros(len(pixels), dtype=torch.int64, device=device), bool((pixels.depth <= 0).any())
     jitter = uniform(generator, device, len(pixels), s.uniform + s.near_depth)
-    rays = make_rays(upload(pixels, device), row, c2w, field.layout.box.to(device), config, jitter, missing)
+    rays = make_rays(upload(pixels, device), row, c2w, field.layout.box.to(device), kernels, config, jitter, missing)
     if missing:
         resample_missing(rays, c2w.float(), field, kernels, s, generator)
     scale = t.unaligned_rate if config.align.to == "none" else 1.0

@@ -102,7 +102,7 @@ class GpuTracker:
     ) -> tuple[Tensor, Tensor]:
         """See ``tracker.track_adam``; rays without depth, where there are any, end where depths do."""
         t, row = config.tracking, torch.zeros_like(pixels.depth, dtype=torch.int64)
-        rays = make_rays(pixels, row, c2w[None], c2w[:2, :3], config, jitter, missing=False)
+        rays = make_rays(pixels, row, c2w[None], c2w[:2, :3], self.kernels, config, jitter, missing=False)
         batch = (getattr(rays, name) for name in RayBatch.__dataclass_fields__)
         weights = kernel_weights(t.loss, config)
         best, terms = descend_rendered(field, self.kernels, weights, t.iterations, t.momentum, c2w[None], rates, *batch)

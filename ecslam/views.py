@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .config import Config
 from .field import TsdfField
 from .kernels import Backend, RayBatch
-from .samples import stratified
+from .kernels.reference_depths import stratified
 from .types import Intrinsics
 
 CHUNK_POINTS = 1 << 18

@@ -27,10 +27,9 @@ from on_gpu import DEVICE, INTERPRETED, moved, run
 
 from ecslam.config import FieldConfig
 from ecslam.field import grow_field
-from ecslam.kernels import FieldParams, PoseMoments, depths_gpu, gpu, reference
+from ecslam.kernels import FieldParams, PoseMoments, gpu, reference
 from ecslam.kernels.poses_gpu import pose_step
 from ecslam.pose_adam import BETA2, EPSILON, PoseAdam
-from ecslam.samples import follow_plain
 
 torch.set_num_threads(1)
 SIZES = (0, 1, 63, 64, 65, 300)
@@ -244,7 +243,7 @@ def test_depths_that_follow_a_rendering(rays, samples, more):
     weights = torch.exp(-(((z - z[:, 2:3]) / 0.2) ** 2))
     weights[::5] = 0
     jitter = torch.rand(rays, 2 * more, generator=random)[:, ::2]
-    found = run(depths_gpu.follow, z, weights, jitter)
-    assert_close([found], [follow_plain(z.double(), weights.double(), jitter.double())])
+    found = run(gpu.importance_depths, z, weights, jitter)
+    assert_close([found], [reference.importance_depths(z.double(), weights.double(), jitter.double())])
     assert (found.diff(dim=1) >= 0).all()
     assert torch.isin(z, found).all()

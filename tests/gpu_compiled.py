@@ -20,7 +20,7 @@ from triton.runtime.jit import JITFunction
 from ecslam.config import FieldConfig
 
 torch.cuda.is_available, available = lambda: True, torch.cuda.is_available
-from ecslam.kernels import PoseMoments, Rules, depths_gpu, fusion_gpu, gpu, tracking_gpu  # noqa: E402
+from ecslam.kernels import PoseMoments, Rules, fusion_gpu, gpu, tracking_gpu  # noqa: E402
 
 torch.cuda.is_available = available
 LAUNCH = JITFunction.run
@@ -58,9 +58,9 @@ def launch_the_map(variants):
     mean, square, rates = (torch.zeros(30, 6).double() for _ in range(3))
     moments = PoseMoments(mean, square, torch.zeros(30, 3).double(), (0.5, 0.9), 1e-8)
     gpu.pose_step(poses, torch.zeros(30, 3, 4), moments, rates, 1)
-    depths_gpu.follow(torch.zeros(64, 32), torch.zeros(64, 32), torch.zeros(64, 11))
+    gpu.importance_depths(torch.zeros(64, 32), torch.zeros(64, 32), torch.zeros(64, 11))
     if variants:
-        depths_gpu.follow(torch.zeros(64, 96), torch.zeros(64, 96), torch.zeros(64, 21))
+        gpu.importance_depths(torch.zeros(64, 96), torch.zeros(64, 96), torch.zeros(64, 21))
         gpu.values(layout, params, points)
         gpu.step(layout, params, c2w, rays, WEIGHTS, None, True)
 

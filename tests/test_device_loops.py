@@ -174,6 +174,8 @@ class NoKernels:
     def render(layout, params, c2w, rays):
         return rays.color, rays.depth, torch.zeros_like(rays.z)
 
+    sample_depths = staticmethod(reference.sample_depths)
+    importance_depths = staticmethod(reference.importance_depths)
     pose_step = staticmethod(reference.pose_step)
 
 
@@ -257,7 +259,7 @@ def test_rays_come_from_their_own_view_in_the_shares_asked_for(config):
     bank, generator = PixelBank(CPU), torch.Generator().manual_seed(0)
     chosen = device_views(bank, views, 5, config, torch.from_numpy(BOX).float(), CPU)
     jitter = uniform(generator, CPU, 2, config.mapping.rays, chosen.numbers(config))
-    rays = DeviceDraw(chosen, jitter, torch.eye(4).expand(5, 4, 4), config, None, None)(1, None)
+    rays = DeviceDraw(chosen, jitter, torch.eye(4).expand(5, 4, 4), config, None, reference)(1, None)
     assert len(rays.depth) == config.mapping.rays
     assert (rays.pose.diff() >= 0).all()
     assert torch.equal(rays.depth, rays.pose.float() + 1)

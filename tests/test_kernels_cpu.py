@@ -21,8 +21,8 @@ from kernel_cases import (
 from ecslam.config import FieldConfig, MappingConfig
 from ecslam.field import grow_field, map_params
 from ecslam.kernels import FieldParams, reference
-from ecslam.losses import smooth_lattice
 from ecslam.pose_adam import PoseAdam
+from ecslam.samples import smooth_lattice
 
 cpu = pytest.importorskip("ecslam.kernels.cpu")
 SIZES = (0, 1, 63, 64, 65, 1000)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ecslam.config import Config, LossWeights, SamplingConfig
+from ecslam.kernels import reference
 from ecslam.pixels import Pixels
 from ecslam.rays import gather, kernel_weights, make_rays, upload, view_centre
 from ecslam.types import Intrinsics
@@ -26,7 +27,7 @@ def rays_of(view, c2w, row=None):
     on_device = upload(view, torch.device("cpu"))
     row = torch.zeros(len(view), dtype=torch.int64) if row is None else row
     jitter = torch.full((len(view), 12), 0.5)
-    return make_rays(on_device, row, c2w, BOX, CONFIG, jitter, missing=True)
+    return make_rays(on_device, row, c2w, BOX, reference, CONFIG, jitter, missing=True)
 
 
 def test_white_is_one_and_a_direction_lies_at_unit_depth():

@@ -8,22 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecslam.config import SamplingConfig
-from ecslam.kernels import RayBatch
-from ecslam.samples import (
-    follow,
-    follow_plain,
-    importance_depths,
-    ray_exit,
-    rendered_depths,
-    sample_depths,
-    sample_plain,
-    stratified,
-    thinned,
-)
+from ecslam.kernels import RayBatch, cpu, reference
+from ecslam.kernels.reference_depths import drawn, importance_depths, stratified
+from ecslam.samples import ray_exit, rendered_depths, thinned
 
 
 def jitter(*shape, seed=0):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def sample_depths(depth, far, config, numbers, kernels=reference):
+    return kernels.sample_depths(depth, far, numbers, config.uniform, config.near_m, config.depth_range_m)
 
 
 @given(st.lists(st.floats(0.2, 6), min_size=1, max_size=20), st.integers(0, 100))
@@ -59,7 +54,7 @@ def test_stratified_puts_one_sample_in_every_interval():
 def test_importance_samples_gather_at_the_weights():
     z = torch.linspace(0, 4, 41).expand(100, 41).contiguous()
     weights = torch.exp(-(((z - 2.5) / 0.1) ** 2))
-    found = importance_depths(z, weights, jitter(100, 11))
+    found = drawn(z, weights, jitter(100, 11))
     assert found.shape == (100, 11)
     assert ((found - 2.5).abs() < 0.4).float().mean() > 0.95
     assert abs(float(found.mean()) - 2.5) < 0.02
@@ -67,6 +62,8 @@ def test_importance_samples_gather_at_the_weights():
 
 class Wall:
     """A back end whose map is a wall at 2.5 m. looked: the depths it was asked to render."""
+
+    importance_depths = staticmethod(importance_depths)
 
     def render(self, layout, params, c2w, rays):
         self.looked = rays.z
@@ -94,13 +91,13 @@ def test_on_a_cpu_one_pass_finds_the_same_bits(rays, uniform, near_depth):
     depth, far = 5 * jitter(rays, seed=1), 0.2 + 4 * jitter(rays, seed=2)
     depth[::4], depth[1::9], depth[2::9] = 0, 0.1, 0.32
     numbers = jitter(rays, uniform + near_depth, seed=3)
-    z = sample_depths(depth, far, config, numbers)
-    assert torch.equal(z, sample_plain(depth, far, config, numbers))
+    z = sample_depths(depth, far, config, numbers, cpu)
+    assert torch.equal(z, sample_depths(depth, far, config, numbers))
     if uniform:
         z, more = thinned(z, config), jitter(rays, 2 * near_depth, seed=4)[:, ::2]
         weights = jitter(rays, uniform, seed=5) ** 8
         weights[::5], weights[1::5, 2:] = 0, 0
-        assert torch.equal(follow(z, weights, more), follow_plain(z, weights, more))
+        assert torch.equal(cpu.importance_depths(z, weights, more), importance_depths(z, weights, more))
 
 
 def test_ray_exit_of_a_box():

@@ -19,9 +19,9 @@ from ..config import Config
 from ..field import TsdfField, create_field, map_params
 from ..kernels import AlignSettings, Backend, RayBatch, Weights
 from ..kernels.graphs import Recorder
+from ..kernels.reference import sample_depths
 from ..kernels.types import FEATURES, HIDDEN
 from ..rays import kernel_weights
-from ..samples import sample_depths
 from ..types import InputError
 
 Job = Callable[[Backend], object]
@@ -199,7 +199,8 @@ def _batch(
     world = torch.einsum("rij,rj->ri", c2w[pose, :3, :3], direction)
     low, high = torch.from_numpy(ROOM).float() * 0.9
     depth = torch.maximum((low - c2w[pose, :3, 3]) / world, (high - c2w[pose, :3, 3]) / world).amin(1)
-    z = sample_depths(depth, depth, config.sampling, torch.rand(count, _samples(config), generator=generator))
+    s, jitter = config.sampling, torch.rand(count, _samples(config), generator=generator)
+    z = sample_depths(depth, depth, jitter, s.uniform, s.near_m, s.depth_range_m)
     color, feature = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) < 0.2
     parts = (t.to(device) for t in (direction, z, depth, color, feature, pose))
     return c2w.to(device), RayBatch(*parts)

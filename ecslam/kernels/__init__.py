@@ -1,4 +1,4 @@
-"""The kernel seam: seven functions, one signature, three back ends.
+"""The kernel seam: nine functions, one signature, three back ends.
 
 ``reference`` (torch, readable, any device), ``cpu`` (numba) and ``gpu`` (Triton). The device picks the back end;
 ``ECSLAM_KERNELS=reference`` or ``with kernels.use("reference")`` overrides. An explicit choice that cannot run raises
@@ -64,6 +64,16 @@ class Backend(Protocol):
         self, layout: GridLayout, params: FieldParams, points: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """TSDF, its gradient, luminance, its gradient at points [N, 3]."""
+        ...
+
+    def sample_depths(
+        self, depth: Tensor, far: Tensor, jitter: Tensor, uniform: int, near_m: float, reach_m: float
+    ) -> Tensor:
+        """Sorted depths [R, S] along rays."""
+        ...
+
+    def importance_depths(self, z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
+        """Depths [R, S + K]: z [R, S] and K more where their weights are."""
         ...
 
     def render(

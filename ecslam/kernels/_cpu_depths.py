@@ -1,4 +1,4 @@
-"""Depths along rays, jitted and in float32 throughout: the same bits as ``samples`` finds with dozens of tensors."""
+"""Depths along rays, jitted, float32 throughout: the same bits as ``reference_depths`` finds with dozens of tensors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def merge(row, filled, more):
 
 @njit(**EXACT)
 def sample_rows(depth, far, jitter, uniform, near, reach, z):
-    """See ``samples.sample_depths``: [R, S] into ``z``."""
+    """See ``reference_depths.sample_depths``: [R, S] into ``z``."""
     rays, samples = jitter.shape
     n_u, n_d = np.float32(max(uniform, 1)), np.float32(max(samples - uniform, 1))
     around = np.empty(samples - uniform, np.float32)
@@ -49,8 +49,8 @@ def sample_rows(depth, far, jitter, uniform, near, reach, z):
 
 
 @njit(**EXACT)
-def follow_rows(z, weights, total, jitter, out):
-    """See ``samples.follow``: [R, S + K] into ``out``. total: [R], the sum of each ray's densities."""
+def importance_rows(z, weights, total, jitter, out):
+    """See ``reference_depths.importance_depths``: into ``out`` [R, S + K]. total: [R], sums of the rays' densities."""
     samples, count = z.shape[1], jitter.shape[1]
     share, more = np.empty(samples - 1, np.float32), np.empty(count, np.float32)
     share[0] = 0

@@ -1,4 +1,4 @@
-"""Triton kernel over blocks of rays: depths that follow what was rendered."""
+"""Triton kernel over blocks of rays: depths drawn from what was rendered."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def at_index(values, step, index):
 
 
 @triton.jit
-def follow_kernel(z, weights, jitter, out, rays, samples, count, block: tl.constexpr, padded: tl.constexpr):
+def importance_kernel(z, weights, jitter, out, rays, samples, count, block: tl.constexpr, padded: tl.constexpr):
     """Ascending depths ``out`` [R, S + K]: z [R, S] and K drawn from their rendering weights by ``jitter`` [R, K].
 
     Both ascend, so each finds its place by counting how many of the others lie below. padded: a power of two, S or

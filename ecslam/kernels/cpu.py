@@ -37,6 +37,8 @@ from ._cpu_work import (
     table_worker,
     values_worker,
 )
+from .depths_cpu import importance_depths as importance_depths
+from .depths_cpu import sample_depths as sample_depths
 from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, PoseMoments, RayBatch, StepResult, Weights
 
 drop_stale(Path(__file__).parent, step_worker.stats.cache_path, "_cpu_*")

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ._gpu_depths import follow_kernel
+from ._gpu_depths import importance_kernel
 from ._gpu_device import beside
 
 ELEMENTS = 128  # of a program, which is a single warp, so that no sum along a ray crosses warps
 
 
-def follow(z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
-    """See ``samples.follow``; at least three depths a ray, all above 0. Never waits for the device."""
+def importance_depths(z: Tensor, weights: Tensor, jitter: Tensor) -> Tensor:
+    """See ``reference_depths.importance_depths``; depths are above 0. Never waits for the device."""
     (rays, samples), count = z.shape, jitter.shape[1]
     out, padded = z.new_empty(rays, samples + count), 1 << (samples - 1).bit_length()
     block = max(1, ELEMENTS // padded)
     if rays:
         with beside(z):
-            follow_kernel[(-(-rays // block),)](
+            importance_kernel[(-(-rays // block),)](
                 *(t.contiguous() for t in (z, weights, jitter)), out, rays, samples, count,
                 block=block, padded=padded, num_warps=1,
             )  # fmt: skip

@@ -28,8 +28,10 @@ from ._gpu_device import beside, processors
 from ._gpu_field import Field, Shape
 from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, place_kernel, values_kernel, weights_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
+from .depths_gpu import importance_depths as importance_depths
 from .poses_gpu import pose_step as pose_step
 from .reference import smoothness as smoothness
+from .reference_depths import sample_depths as sample_depths
 
 VALUES_BLOCK, VALUES_WARPS = 64, 4  # sixteen points a warp, which one instruction of a tensor core takes
 VALUES_REGISTERS = 168  # a thread; so that three programs share a processor

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from .. import se3
+from .reference_depths import importance_depths as importance_depths
+from .reference_depths import sample_depths as sample_depths
 from .types import (
     FEATURES,
     HIDDEN,

@@ -6,7 +6,7 @@ import torch
 from ecslam.config import FieldConfig, MappingConfig
 from ecslam.field import create_field
 from ecslam.kernels import reference
-from ecslam.losses import smooth_lattice
+from ecslam.samples import smooth_lattice
 
 BOX = np.array([[-1.0, -0.5, 0], [1, 0.5, 1.5]])
 FIELD = create_field(
