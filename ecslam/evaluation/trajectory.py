@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rigid import inverse, rotation_angle_deg
+from ..rigid import best_motion, inverse, rotation_angle_deg
 
 Floats = NDArray[np.float64]
 
@@ -78,14 +78,11 @@ def align_umeyama(source: Floats, target: Floats, *, with_scale: bool = False) -
 
     Where the points leave it open (all on a line or at one place) it is one of the best motions.
     """
-    source_mean, target_mean = source.mean(0), target.mean(0)
-    a, b = source - source_mean, target - target_mean
-    u, singular, vt = np.linalg.svd(b.T @ a / len(a))
-    flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = (u * flip) @ vt
-    variance = float((a**2).sum() / len(a))
-    scale = float((singular * flip).sum() / variance) if with_scale and variance > 0 else 1.0
-    return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)
+    rotation, middle, goal = best_motion(source, target)[:3, :3], source.mean(0), target.mean(0)
+    turned = (source - middle) @ rotation.T
+    variance = float((turned**2).sum())
+    scale = float((turned * (target - goal)).sum()) / variance if with_scale and variance > 0 else 1.0
+    return Similarity(rotation, goal - scale * rotation @ middle, scale)
 
 
 def absolute_error(
