@@ -111,7 +111,7 @@ class Slam:
         if keyframe:
             keyframe_now = make_keyframe(frame, self.intrinsics, self.config)
             self.keyframes.append(self._shelf.keep(keyframe_now))
-        if keyframe and index % self.config.mapping.every < self.config.keyframe_every:
+        if keyframe and self._mapping_is_due():
             waited_s = self._apply_pending(block=True)
             loop = self._map(frame.index, interrupt)
         landed, self._landed = self._landed, Landed()
@@ -208,6 +208,11 @@ class Slam:
         met, result = tuple(self.keyframes[i].frame for i in old), mapped.result
         after = sum(result.losses.values())
         return loop_event(frame, met, before, self.trajectory[-1], result.loss_first, after, centres)
+
+    def _mapping_is_due(self) -> bool:
+        """Counted in keyframes, for those that were missed put nothing off by a whole period."""
+        every = self.config.keyframe_every
+        return (len(self.keyframes) - 1) * every % self.config.mapping.every < every
 
     def _check_box(self) -> None:
         assert self.mapper is not None

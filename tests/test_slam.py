@@ -1,5 +1,7 @@
 """The engine as a whole, on a few small frames of a built-in room."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -77,6 +79,17 @@ def test_a_mapping_begins_at_the_first_keyframe_when_it_is_due(every, mapped):
     engine = Slam(apply_settings(load_preset("live"), settings), room.intrinsics, first_pose=room[0].c2w_gt)
     reports = [engine.step(room[i]) for i in range(21)]
     assert [r.frame for r in reports if r.window] == mapped
+
+
+def test_a_mapping_whose_keyframe_was_missed_begins_with_the_next():
+    room = open_sequence("synthetic/studio?size=160x120&frames=300")
+    settings = [*SMALL, "mapping.iterations=1", "mapping.every=10"]
+    engine = Slam(apply_settings(load_preset("live"), settings), room.intrinsics, first_pose=room[0].c2w_gt)
+    frames = [room[i] for i in range(21)]
+    frames[10] = replace(frames[10], depth=np.zeros_like(frames[10].depth))
+    reports = [engine.step(frame) for frame in frames]
+    assert [r.frame for r in reports if r.is_keyframe] == [0, 5, 15, 20]
+    assert [r.frame for r in reports if r.window] == [0, 15]
 
 
 def off_surface(engine):
