@@ -96,6 +96,17 @@ def load_run(folder: Path) -> Run:
     )
 
 
+def truth_apart(a: Run, b: Run) -> float:
+    """Median distance (metres) of the true cameras of two runs at the frames that both have; 0 where there are none."""
+    if a.trajectory_gt is None or b.trajectory_gt is None:
+        return 0.0
+    frames_a, frames_b = (np.array([row["frame"] for row in run.rows], np.int64) for run in (a, b))
+    _, rows_a, rows_b = np.intersect1d(frames_a, frames_b, return_indices=True)
+    apart = np.linalg.norm(a.trajectory_gt[rows_a, :3, 3] - b.trajectory_gt[rows_b, :3, 3], axis=1)
+    known = apart[np.isfinite(apart)]
+    return float(np.median(known)) if len(known) else 0.0
+
+
 def frame_rows(folder: Path) -> tuple[dict[str, Any], ...]:
     """A line for each frame that a run folder has on record so far; none where there is no ``metrics.jsonl``."""
     return tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())

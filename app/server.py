@@ -15,10 +15,11 @@ from .front import close_viser, is_loopback, open_viser
 from .hub import Hub
 from .listen import bind
 from .replay import ReplayEngine
-from .runs import load_run
+from .runs import load_run, truth_apart
 
 DEFAULT_PORT = 8080
 SHORTEST_TOKEN = 16
+SAME_TRUTH_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -91,5 +92,11 @@ def view(
     if len(names) > 1:
         raise InputError(
             f"{runs[0]} and {runs[1]}: runs on different sequences ({', '.join(sorted(names))}) cannot be compared"
+        )
+    apart = max((truth_apart(loaded[0], other) for other in loaded[1:]), default=0.0)
+    if apart > SAME_TRUTH_M:
+        raise InputError(
+            f"{runs[0]} and {runs[1]}: at the same frames their cameras really were {100 * apart:.1f} cm apart, so "
+            "these are not runs on the same recording and cannot be compared"
         )
     return start(ReplayEngine(loaded[0], tuple(loaded[1:])), host, port, token, dark)

@@ -237,8 +237,20 @@ def test_runs_on_different_sequences_are_not_compared(folder, tmp_path):
         server.view([folder, other], port=0)
 
 
+def test_runs_of_different_length_are_compared_unless_their_cameras_really_were_elsewhere(folder, tmp_path):
+    """A built-in room of 300 frames and one of 2,000 bear the same name."""
+    shorter = write_run(tmp_path / "shorter", FRAMES // 2)
+    lines = (folder / "groundtruth.txt").read_text().splitlines(keepends=True)
+    (shorter / "groundtruth.txt").write_text("".join(lines[: FRAMES // 2]))
+    server.view([folder, shorter], port=0).close()
+    moved = [f"{t} {float(x) + 0.02} {rest}" for t, x, rest in (line.split(" ", 2) for line in lines)]
+    (shorter / "groundtruth.txt").write_text("".join(moved))
+    with pytest.raises(InputError, match=r"2\.0 cm apart"):
+        server.view([folder, shorter], port=0)
+
+
 def test_a_killed_run_is_compared_by_what_was_written_when_it_began(folder, tmp_path):
-    killed = write_run(tmp_path / "killed", 20)
+    killed = write_run(tmp_path / "killed", FRAMES)
     (killed / "summary.json").unlink()
     (killed / "run.json").write_text(json.dumps({"name": "synthetic/studio"}))
     page = server.view([killed, folder], port=0)
