@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -17,8 +18,9 @@ from ecslam.types import InputError
 def root(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     room = open_sequence("synthetic/studio?size=32x24&frames=2")
-    for name in ("b", "a/deep/er", "a/far/too/deep", ".hidden/c"):
-        write_replica(room, root / name)
+    write_replica(room, root / "b")
+    for name in ("a/deep/er", "a/far/too/deep", ".hidden/c"):
+        shutil.copytree(root / "b", root / name)
     (root / "notes").mkdir()
     (root / "notes" / "a.txt").write_text("nothing")
     return root
@@ -40,8 +42,8 @@ def test_a_root_without_sequences_is_an_error(root, name, says):
         sequences_under(root / name)
 
 
-def test_a_folder_that_cannot_be_read_is_passed_over(tmp_path, monkeypatch):
-    write_replica(open_sequence("synthetic/studio?size=32x24&frames=2"), tmp_path / "room")
+def test_a_folder_that_cannot_be_read_is_passed_over(root, tmp_path, monkeypatch):
+    shutil.copytree(root / "b", tmp_path / "room")
     (tmp_path / "lost+found").mkdir()
     listed = Path.iterdir
 

@@ -127,6 +127,7 @@ def test_a_loop_that_follows_growth_is_recorded_again(room, config):
     assert graphs.recorded == 2
 
 
+@pytest.mark.slow
 def test_tracking_is_the_same_recorded_and_plain(room, config):
     views, poses = keyframes(room, config)
     one = mapper(room, config)
@@ -145,6 +146,7 @@ def test_tracking_is_the_same_recorded_and_plain(room, config):
     assert (graphs.recorded, graphs.replayed) == (1, 2)
 
 
+@pytest.mark.slow
 def test_steps_are_longer_where_no_alignment_came_before(room, config):
     views, poses = keyframes(room, config)
     one = mapper(room, config)

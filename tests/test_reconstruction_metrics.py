@@ -161,6 +161,7 @@ def test_a_surface_is_as_near_to_itself_as_its_samples_are_dense() -> None:
     assert (same.accuracy_cm, same.completion_cm, same.completion_ratio) == (0, 0, 100)
 
 
+@pytest.mark.slow
 def test_walls_moved_by_three_centimetres_are_three_centimetres_away() -> None:
     rng = np.random.default_rng(0)
     small = (1.0, 0.8, 0.7)

@@ -136,6 +136,7 @@ def test_the_box_grows_when_the_camera_leaves_it():
     assert error_cm(slam, 60) < 5
 
 
+@pytest.mark.slow
 def test_a_map_that_began_small_stays_within_its_table():
     """A camera that first sees a metre of the room gets small cells, too many to be dense in the whole of it."""
     middle = ROOM.bounds.mean(0)
@@ -192,6 +193,7 @@ def test_a_camera_that_comes_back_elsewhere_than_it_was_lost_is_found():
     assert error_cm(slam, 30) < 3
 
 
+@pytest.mark.slow
 def test_a_camera_that_comes_back_where_half_of_what_it_sees_is_new_is_recognised():
     slam = engine(live("mapping.iterations=2"))
     walk(slam, list(range(30)))

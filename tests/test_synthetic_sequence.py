@@ -101,6 +101,7 @@ def test_mesh_is_the_surface(name):
     assert mesh.faces.max() == len(mesh.vertices) - 1
 
 
+@pytest.mark.slow
 def test_mesh_covers_what_the_camera_sees_in_its_colours():
     from scipy.spatial import cKDTree
 
@@ -115,6 +116,7 @@ def test_mesh_covers_what_the_camera_sees_in_its_colours():
     assert np.median(error) < 15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["studio", "corridor"])
 def test_mesh_has_no_gaps_where_surfaces_meet(name):
     sequence = open_synthetic(name, width=320, height=240)
