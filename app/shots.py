@@ -12,18 +12,22 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from ecslam.messages import RunTo
 from ecslam.types import InputError
 
 from .browser import dismiss_toasts, launch, new_page
+from .runs import load_run
 from .server import Dashboard, view
 
 DESKTOP, PHONE = (1440, 860), (390, 780)
 SETTLE_MS, MOST_LOOKS = 1500, 30
 STILL = 0.02  # mean change of grey values
+FILM_STEPS, FILM_SIZE, STEP_MS, END_MS = 36, (960, 573), 160, 2500
 
 
 def take(runs: list[Path], out: Path) -> list[Path]:
-    """Write the pictures light, dark, phone, loops and (with two runs) compare into ``out``. Raises InputError."""
+    """Write the pictures light, dark, phone, loops and (with two runs) compare, and the film of the first run, into
+    ``out``. Raises InputError."""
     out.mkdir(parents=True, exist_ok=True)
     made = []
     with launch() as browser:
@@ -33,6 +37,7 @@ def take(runs: list[Path], out: Path) -> list[Path]:
                 made.append(_take_one(browser, dashboard, size, act, out / f"dashboard_{name}.png"))
             finally:
                 dashboard.close()
+        made.append(_film(browser, runs[0], out / "dashboard.webp"))
     return made
 
 
@@ -52,17 +57,41 @@ def _pictures(
 def _take_one(
     browser: Any, dashboard: Dashboard, size: tuple[int, int], act: Callable[[Any, Dashboard], None], path: Path
 ) -> Path:
+    page = _opened(browser, dashboard, size)
+    act(page, dashboard)
+    dismiss_toasts(page)
+    path.write_bytes(lighter(_still(page)))
+    page.close()
+    return path
+
+
+def _film(browser: Any, run: Path, path: Path) -> Path:
+    """A run from its first frame to its last as an animated picture."""
+    dashboard = view([run], port=0)
+    try:
+        page, steps = _opened(browser, dashboard, DESKTOP), []
+        _show_plots(page, dashboard)
+        for frame in np.linspace(0, load_run(run).last, FILM_STEPS).round().astype(int):
+            dashboard.engine.submit(RunTo(int(frame)))
+            dismiss_toasts(page)
+            steps.append(_picture(_still(page)).resize(FILM_SIZE, Image.Resampling.LANCZOS))
+        page.close()
+    finally:
+        dashboard.close()
+    shown = [STEP_MS] * (len(steps) - 1) + [END_MS]
+    steps[0].save(path, save_all=True, append_images=steps[1:], duration=shown, loop=0, quality=80, method=6)
+    return path
+
+
+def _opened(browser: Any, dashboard: Dashboard, size: tuple[int, int]) -> Any:
+    """The dashboard's page, with its mesh."""
     page = new_page(browser, *size)
     page.goto(dashboard.url)
     page.locator(".ec-row b").wait_for()
     while dashboard.hub.scene.mesh is None:
         page.wait_for_timeout(100)
     page.wait_for_timeout(SETTLE_MS)
-    act(page, dashboard)
-    dismiss_toasts(page)
-    path.write_bytes(lighter(_still(page)))
-    page.close()
-    return path
+    return page
 
 
 def _still(page: Any) -> bytes:
@@ -78,10 +107,14 @@ def _still(page: Any) -> bytes:
     return bytes(png)
 
 
+def _picture(png: bytes) -> Image.Image:
+    return Image.open(io.BytesIO(png)).convert("RGB")
+
+
 def lighter(png: bytes) -> bytes:
     """A screenshot as a smaller PNG, without the lowest bit of its colours, which nobody sees."""
     out = io.BytesIO()
-    Image.fromarray(np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) | 1).save(out, "png", optimize=True)
+    Image.fromarray(np.asarray(_picture(png)) | 1).save(out, "png", optimize=True)
     return out.getvalue()
 
 
