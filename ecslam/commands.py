@@ -118,13 +118,20 @@ def make_engine(
 
 def lasting_address(address: str) -> str:
     """The address of a sequence as it can be opened from any folder."""
-    return address if address.startswith("synthetic/") else str(Path(address).expanduser().resolve())
+    if address.startswith("synthetic/"):
+        return address
+    path = datasets.split_address(address)[0]
+    return str(Path(path).expanduser().resolve()) + address.removeprefix(path)
 
 
 def resume_engine(folder: Path, device: str, sequence: str | None) -> Engine:
     """The engine of an interrupted run; ``sequence``: where that lies now, if it has moved. Raises InputError."""
     address = str(load_checkpoint(folder / "checkpoints").meta["sequence"])
-    if sequence is None and not address.startswith("synthetic/") and not Path(address).exists():
+    if (
+        sequence is None
+        and not address.startswith("synthetic/")
+        and not Path(datasets.split_address(address)[0]).exists()
+    ):
         raise InputError(f"{folder}: its sequence is no longer at {address}; say where it is with --sequence")
     moved = None if sequence is None else lasting_address(sequence)
     return Engine.resume(folder, device=device, sequences=BUILT_IN, sequence=moved)

@@ -6,10 +6,12 @@ A new layout is one new file: its docstring's first line says, after the name an
 from __future__ import annotations
 
 import importlib
+import os
 import pkgutil
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast
+from urllib.parse import parse_qsl
 
 from ..types import InputError, Sequence
 
@@ -17,15 +19,19 @@ SYNTHETIC = "synthetic/"
 
 
 class Layout(Protocol):
-    """A module of this folder that knows one way of laying a sequence out on disk."""
+    """A module of this folder that knows one way of laying a sequence out on disk.
+
+    Where a file can be a sequence, ``SUFFIXES`` are those of such files; ``OPTIONS``: what may follow a ``?`` after the
+    path, which ``open`` takes by these names.
+    """
 
     __name__: str
     __doc__: str | None
 
     def sniff(self, path: Path) -> bool:
-        """Whether the folder ``path`` is laid out this way, from file names only."""
+        """Whether ``path``, mostly a folder, is laid out this way, from file names only."""
 
-    def open(self, path: Path) -> Sequence:
+    def open(self, path: Path, **options: str) -> Sequence:
         """Open it. Raises InputError when something is wrong with it."""
 
 
@@ -39,12 +45,12 @@ def layouts() -> tuple[Layout, ...]:
 
 
 def summary(layout: Layout) -> str:
-    """One line on what a folder of this layout holds."""
+    """One line on what such a sequence is made of."""
     return (layout.__doc__ or layout.__name__).strip().splitlines()[0].rstrip(".")
 
 
 def open_sequence(path_or_address: str | Path, **synthetic_options: Any) -> Sequence:
-    """Open a folder of any known layout, or a built-in room such as ``synthetic/studio``.
+    """Open a folder or file of any known layout, or a built-in room such as ``synthetic/studio``.
 
     ``synthetic_options`` go to the built-in rooms (image size, number of frames ...). Raises InputError, in one line,
     when there is no such folder, it is laid out in no known way, or its parts do not belong together.
@@ -59,9 +65,18 @@ def open_sequence(path_or_address: str | Path, **synthetic_options: Any) -> Sequ
             f"{address}: {', '.join(synthetic_options)} can be set for {SYNTHETIC}... only, not for a folder"
         )
     try:
-        return _open_folder(_resolve(address))
+        path, options = split_address(address)
+        return _open_path(_resolve(path), options)
     except OSError as error:
         raise InputError(f"{address}: cannot be opened ({error.strerror}); give a readable folder") from None
+
+
+def split_address(address: str) -> tuple[str, dict[str, str]]:
+    """The path of a recording, and the options that follow it after ``?``."""
+    path, mark, query = address.rpartition("?")
+    if not mark or os.path.exists(address):
+        return address, {}
+    return path, dict(parse_qsl(query, keep_blank_values=True))
 
 
 def _resolve(address: str) -> Path:
@@ -71,34 +86,49 @@ def _resolve(address: str) -> Path:
         raise InputError(f"{address!r}: not a path ({error}); give the folder of a sequence") from None
 
 
-def _open_folder(folder: Path) -> Sequence:
-    if not folder.exists():
+def _open_path(path: Path, options: dict[str, str]) -> Sequence:
+    if not path.exists():
         raise InputError(
-            f"{folder}: no such folder; give the folder of a sequence, or {SYNTHETIC}studio for a built-in room"
+            f"{path}: no such folder; give the folder of a sequence, or {SYNTHETIC}studio for a built-in room"
         )
-    if not folder.is_dir():
-        raise InputError(f"{folder}: a file; give the folder that holds the sequence")
-    names = sorted(p.name for p in folder.iterdir())
+    layout = _recognise(path)
+    if layout is None:
+        raise InputError(_why_unknown(path))
+    taken = getattr(layout, "OPTIONS", ())
+    wrong = next((name for name in options if name not in taken), None)
+    if wrong is not None:
+        raise InputError(f"{path}: takes no option {wrong!r}; {', '.join(taken) or 'none'} can follow the path")
+    return layout.open(path, **options)
+
+
+def _why_unknown(path: Path) -> str:
+    if not path.is_dir():
+        return (
+            f"{path}: a file, and not one of {', '.join(sorted(suffixes()))}; give the folder that holds the sequence"
+        )
+    names = sorted(p.name for p in path.iterdir())
     if not names:
-        raise InputError(f"{folder}: an empty folder; give a folder that holds a sequence")
-    layout = _recognise(folder)
-    if layout is not None:
-        return layout.open(folder)
-    inside = next((p for p in sorted(folder.iterdir())[:100] if looks_like_one(p)), None)
+        return f"{path}: an empty folder; give a folder that holds a sequence"
+    inside = next((p for p in sorted(path.iterdir())[:100] if looks_like_one(p)), None)
     if inside is not None:
-        raise InputError(f"{folder}: not a sequence itself; did you mean {inside}?")
+        return f"{path}: not a sequence itself; did you mean {inside}?"
     found = ", ".join(names[:4]) + (" ..." if len(names) > 4 else "")
     known = "; ".join(summary(layout) for layout in layouts())
-    raise InputError(f"{folder}: no known layout (it holds {found}); rearrange it as one of these: {known}")
+    return f"{path}: no known layout (it holds {found}); rearrange it as one of these: {known}"
 
 
-def looks_like_one(folder: Path) -> bool:
-    """Whether a sequence seems to lie in ``folder``, by file names alone; not where those cannot be read."""
+def suffixes() -> frozenset[str]:
+    """Of files that may be sequences."""
+    return frozenset(suffix for layout in layouts() for suffix in getattr(layout, "SUFFIXES", ()))
+
+
+def looks_like_one(path: Path) -> bool:
+    """Whether ``path`` seems to be a sequence, by file names alone; not where those cannot be read."""
     try:
-        return folder.is_dir() and _recognise(folder) is not None
+        return _recognise(path) is not None
     except OSError:
         return False
 
 
-def _recognise(folder: Path) -> Layout | None:
-    return next((layout for layout in layouts() if layout.sniff(folder)), None)
+def _recognise(path: Path) -> Layout | None:
+    return next((layout for layout in layouts() if layout.sniff(path)), None)

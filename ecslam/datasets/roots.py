@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 from ..types import InputError
-from .registry import looks_like_one
+from .registry import looks_like_one, suffixes
 
 DEEPEST, MOST_FOLDERS = 3, 2000
 
@@ -20,7 +20,7 @@ def sequences_under(root: Path) -> tuple[str, ...]:
     folder, or nothing in it that is recognised.
     """
     folder = root.expanduser().resolve()
-    if not folder.is_dir():
+    if not folder.exists():
         raise InputError(f"--data {root}: no such folder; give one that holds sequences")
     found = tuple(str(each) for each in islice(_folders(folder, DEEPEST), MOST_FOLDERS) if looks_like_one(each))
     if not found:
@@ -29,12 +29,16 @@ def sequences_under(root: Path) -> tuple[str, ...]:
 
 
 def _folders(folder: Path, deeper: int) -> Iterator[Path]:
-    """``folder`` and the folders below it that may hold a sequence; nothing lies inside one."""
+    """``folder``, and the folders and files below it that may be a sequence; nothing lies inside one."""
     yield folder
     if deeper == 0 or looks_like_one(folder):
         return
     try:
-        inside = sorted(entry.path for entry in os.scandir(folder) if entry.is_dir() and entry.name[0] != ".")
+        inside = sorted(
+            entry.path
+            for entry in os.scandir(folder)
+            if entry.name[0] != "." and (entry.is_dir() or Path(entry.name).suffix in suffixes())
+        )
     except OSError:
         return
     for path in inside:
