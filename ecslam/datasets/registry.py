@@ -119,7 +119,12 @@ def _why_unknown(path: Path) -> str:
 
 def suffixes() -> frozenset[str]:
     """Of files that may be sequences."""
-    return frozenset(suffix for layout in layouts() for suffix in getattr(layout, "SUFFIXES", ()))
+    return frozenset(suffix for layout in layouts() for suffix in suffixes_of(layout))
+
+
+def suffixes_of(layout: Layout) -> tuple[str, ...]:
+    """Of files that may be sequences of this layout; mostly none."""
+    return cast("tuple[str, ...]", getattr(layout, "SUFFIXES", ()))
 
 
 def looks_like_one(path: Path) -> bool:
@@ -131,4 +136,5 @@ def looks_like_one(path: Path) -> bool:
 
 
 def _recognise(path: Path) -> Layout | None:
-    return next((layout for layout in layouts() if layout.sniff(path)), None)
+    folder = path.is_dir()
+    return next((each for each in layouts() if (folder or path.suffix in suffixes_of(each)) and each.sniff(path)), None)
