@@ -323,7 +323,8 @@ def test_the_error_for_an_unknown_folder_lists_every_layout(tmp_path: Path) -> N
     with pytest.raises(InputError, match=r"notes\.md") as caught:
         open_sequence(tmp_path)
     assert all(
-        name in str(caught.value) for name in ("7-Scenes", "TUM", "NICE-SLAM", "vMAP", "ScanNet", "Stray", "Neural", "ROS")
+        name in str(caught.value)
+        for name in ("7-Scenes", "TUM", "NICE-SLAM", "vMAP", "ScanNet", "Stray", "Neural", "ROS")
     )
 
 

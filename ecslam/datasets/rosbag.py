@@ -89,7 +89,7 @@ def open(path: Path, color: str = "", depth: str = "") -> RosRecording:
         times=times,
         poses=poses,
         color_size=color_topic.kind.size,
-        notes=(*recording.ended, *((unpaired,) if any(dropped) else ()), *camera_notes, *pose_notes),
+        notes=(*recording.lost, *((unpaired,) if any(dropped) else ()), *camera_notes, *pose_notes),
         recording=recording,
         color=color_topic,
         depth=depth_topic,

@@ -14,6 +14,7 @@ from ..types import FrameError
 
 MOST_BYTES = 256 << 20  # of a message, or of a chunk unpacked
 CHUNKS_KEPT = 4
+SQLITE_ERRORS = sqlite3.Error, ValueError, TypeError, OverflowError  # also of what is of another type, or no text
 ZSTD = b"\x28\xb5\x2f\xfd"
 
 
@@ -100,7 +101,7 @@ def _row(place: Place) -> bytes:
     try:
         with closing(open_sqlite(place.file)) as database:
             row = database.execute("SELECT data FROM messages WHERE id = ?", (place.at,)).fetchone()
-    except sqlite3.Error as error:
+    except SQLITE_ERRORS as error:
         raise DamagedError(f"a damaged database ({error})") from None
     if row is None or not isinstance(row[0], bytes):
         raise DamagedError("a message is gone")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..types import InputError
-from .rosfiles import ZSTD, Chunk, DamagedError, Place, exactly, open_sqlite, unpack, unpacked_message
+from .rosfiles import SQLITE_ERRORS, ZSTD, Chunk, DamagedError, Place, exactly, open_sqlite, unpack, unpacked_message
 
 GLANCE = 192  # bytes of a record that are read in passing
 MOST_ABOUT_BYTES = 16 << 20  # of what describes a topic
@@ -29,12 +29,12 @@ BAG_MAGIC, MCAP_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"
 @dataclass
 class Index:
     """What a recording holds. ros1: how messages are encoded. types: by topic, as ``sensor_msgs/msg/Image``. places: by
-    topic, in the order of recording. ended: why a file was not read to its end, one sentence each."""
+    topic, in the order of recording. lost: what of the files could not be read, one sentence each."""
 
     ros1: bool = False
     types: dict[str, str] = field(default_factory=dict)
     places: dict[str, list[Place]] = field(default_factory=lambda: defaultdict(list))
-    ended: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
 
 
 def find_messages(files: list[Path], wanted: frozenset[str]) -> Index:
@@ -45,12 +45,13 @@ def find_messages(files: list[Path], wanted: frozenset[str]) -> Index:
         walk = walks[file.suffix](file, index, wanted)
         try:
             walk.run()
+            index.lost += walk.notes()
         except OSError as error:
             raise InputError(f"{file}: cannot be read ({error.strerror})") from None
         except DamagedError as error:
             if not walk.topics:
                 raise InputError(f"{file}: {error}; copy or record it again") from None
-            index.ended.append(f"{file.name} is damaged or breaks off ({error}): what comes before is read")
+            index.lost.append(f"{file.name} is damaged or breaks off ({error}): what comes before is read")
     return index
 
 
@@ -60,10 +61,17 @@ class _Walk:
     def __init__(self, file: Path, index: Index, wanted: frozenset[str]) -> None:
         self.file, self.index, self.wanted = file, index, wanted
         self.topics: dict[object, str] = {}
+        self.damaged_chunks = 0
 
     def run(self) -> None:
         """Raises DamagedError, OSError."""
         raise NotImplementedError
+
+    def notes(self) -> list[str]:
+        """What was left out on the way."""
+        if not self.damaged_chunks:
+            return []
+        return [f"{self.damaged_chunks} chunks of {self.file.name} are damaged and are left out"]
 
     def topic(self, connection: object, name: str, kind: str) -> None:
         package, _, rest = kind.partition("/")
@@ -72,6 +80,18 @@ class _Walk:
 
     def wants(self, connection: object) -> bool:
         return self.index.types.get(self.topics.get(connection, "")) in self.wanted
+
+    def packed(self, data: bytes, chunk: Chunk) -> None:
+        """The records of a compressed chunk; a damaged one costs no other."""
+        try:
+            data = unpack(data, chunk.packing, chunk.full)
+            self.records(BytesIO(data), 0, len(data), chunk, inside=True)
+        except DamagedError:
+            self.damaged_chunks += 1
+
+    def records(self, stream: BinaryIO, at: int, end: int, chunk: Chunk | None = None, inside: bool = False) -> None:
+        """Those from ``at`` to ``end``, of the file or of ``chunk``. Raises DamagedError."""
+        raise NotImplementedError
 
     def message(self, connection: object, time_ns: int, chunk: Chunk | None, at: int, size: int, start: bytes) -> None:
         """start: at least its first 12 bytes. time_ns: of recording, for messages that have no time."""
@@ -88,9 +108,9 @@ class _BagWalk(_Walk):
         with self.file.open("rb", buffering=0) as stream:
             if stream.read(len(BAG_MAGIC)) != BAG_MAGIC:
                 raise DamagedError("not a bag of ROS 1, format 2.0")
-            self._records(stream, len(BAG_MAGIC), self.file.stat().st_size)
+            self.records(stream, len(BAG_MAGIC), self.file.stat().st_size)
 
-    def _records(self, stream: BinaryIO, at: int, end: int, chunk: Chunk | None = None, inside: bool = False) -> None:
+    def records(self, stream: BinaryIO, at: int, end: int, chunk: Chunk | None = None, inside: bool = False) -> None:
         while at < end:
             fields, at, size, start = _bag_record(stream, at)
             kind, connection = fields.get(b"op"), fields.get(b"conn")
@@ -109,11 +129,10 @@ class _BagWalk(_Walk):
     def _chunk(self, stream: BinaryIO, at: int, size: int, end: int, fields: dict[bytes, bytes]) -> None:
         packing = _text(fields[b"compression"])
         if packing == "none":
-            self._records(stream, at, end, inside=True)
+            self.records(stream, at, end, inside=True)
             return
-        chunk = Chunk(at, size, packing, struct.unpack("<I", fields[b"size"])[0])
-        data = unpack(exactly(stream, at, size), packing, chunk.full)
-        self._records(BytesIO(data), 0, len(data), chunk, inside=True)
+        chunk = Chunk(at, size, packing, int.from_bytes(fields[b"size"], "little"))
+        self.packed(exactly(stream, at, size), chunk)
 
 
 def _bag_record(stream: BinaryIO, at: int) -> tuple[dict[bytes, bytes], int, int, bytes]:
@@ -153,9 +172,9 @@ class _McapWalk(_Walk):
         with self.file.open("rb", buffering=0) as stream:
             if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
                 raise DamagedError("not an MCAP file")
-            self._records(stream, len(MCAP_MAGIC), self.file.stat().st_size)
+            self.records(stream, len(MCAP_MAGIC), self.file.stat().st_size)
 
-    def _records(self, stream: BinaryIO, at: int, end: int, chunk: Chunk | None = None, inside: bool = False) -> None:
+    def records(self, stream: BinaryIO, at: int, end: int, chunk: Chunk | None = None, inside: bool = False) -> None:
         while at < end:
             stream.seek(at)
             glance = stream.read(GLANCE)
@@ -201,11 +220,9 @@ class _McapWalk(_Walk):
         (size,) = about.numbers("<Q")
         at += about.at
         if not packing:
-            self._records(stream, at, min(at + size, end), inside=True)
+            self.records(stream, at, min(at + size, end), inside=True)
             return
-        chunk = Chunk(at, size, packing, full)
-        data = unpack(exactly(stream, at, size), packing, full)
-        self._records(BytesIO(data), 0, len(data), chunk, inside=True)
+        self.packed(exactly(stream, at, size), Chunk(at, size, packing, full))
 
 
 class _Cursor:
@@ -237,7 +254,7 @@ class _SqliteWalk(_Walk):
                 for number in filter(self.wants, tuple(self.topics)):
                     for row, time_ns, size, start in _rows(database, number):
                         self.message(number, time_ns, None, row, size, start)
-        except sqlite3.Error as error:
+        except SQLITE_ERRORS as error:
             raise DamagedError(f"a damaged database: {error}") from None
 
 

@@ -25,7 +25,7 @@ class Recording:
         except ImportError:
             raise InputError(f"{path}: recordings of ROS need rosbags; pip install rosbags lz4") from None
         found = find_messages(files, frozenset((IMAGE, COMPRESSED, CAMERA_INFO, TRANSFORMS, OLD_TRANSFORMS)))
-        self.path, self.types, self.places, self.ended = path, found.types, found.places, tuple(found.ended)
+        self.path, self.types, self.places, self.lost = path, found.types, found.places, tuple(found.lost)
         store = get_typestore(Stores.ROS1_NOETIC if found.ros1 else Stores.ROS2_HUMBLE)
         if TRANSFORMS not in store.types:
             store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))

@@ -56,7 +56,7 @@ def choose(recording: Recording, color: str, depth: str) -> tuple[Topic, Topic]:
     depths = [t for t in topics if t.name == depth or (not depth and t.kind.is_depth and not _infrared(t))]
     for what, found in (("colour", colors), ("depth", depths)):
         if not found:
-            reasons = "".join(f"; {reason}" for reason in list(unreadable.values())[:1])
+            reasons = "".join(f"; {reason}" for reason in [*recording.lost, *unreadable.values()][:1])
             raise InputError(
                 f"{recording.path}: no {what} images among its topics ({_listed(topics)}){reasons}; record them too"
             )
@@ -123,7 +123,7 @@ def _registered(pairs: list[tuple[Topic, Topic]]) -> list[tuple[Topic, Topic]]:
 def _best(pairs: list[tuple[Topic, Topic]], recording: Recording) -> tuple[Topic, Topic]:
     def unusual(pair: tuple[Topic, Topic]) -> tuple[Any, ...]:
         color, depth = pair
-        return color.rectified != depth.rectified, color.unusual, depth.unusual
+        return color.unusual, depth.unusual, color.rectified != depth.rectified
 
     least = min(map(unusual, pairs))
     best = [pair for pair in pairs if unusual(pair) == least]
@@ -140,15 +140,12 @@ def _listed(topics: list[Topic]) -> str:
 
 
 def _camera(info: Any, color: Topic, depth: Topic, place: str) -> Intrinsics:
-    """Where both are rectified, of the projection; else of the lens, with its distortion."""
-    if color.rectified and depth.rectified:
-        matrix, distortion = (info.p if hasattr(info, "p") else info.P).reshape(3, 4), NO_DISTORTION
-    else:
-        matrix, distortion = (info.k if hasattr(info, "k") else info.K).reshape(3, 3), _distortion(info, place)
-        if distortion and color.rectified != depth.rectified:
-            raise InputError(
-                f"{place}: only one of {color.name} and {depth.name} is rectified; record both so, or neither"
-            )
+    """Of what is left when the images are undistorted as ``distortion`` tells: nothing is, where they are rectified."""
+    lens, projection = (info.k, info.p) if hasattr(info, "k") else (info.K, info.P)
+    matrix = projection.reshape(3, 4) if color.rectified and np.any(projection) else lens.reshape(3, 3)
+    distortion = NO_DISTORTION if color.rectified and depth.rectified else _distortion(info, place)
+    if distortion and color.rectified != depth.rectified:
+        raise InputError(f"{place}: only one of {color.name} and {depth.name} is rectified; record both so, or neither")
     if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
         raise InputError(f"{place}: holds what is not a number; calibrate the camera and record it again")
     fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))

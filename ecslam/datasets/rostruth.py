@@ -38,9 +38,7 @@ def true_poses(
     if frames[-1] not in WORLDS or any(word in frame for frame in frames for word in ESTIMATED):
         others = [topic for topic, kind in recording.types.items() if kind in POSES]
         others += [f"transforms from {frames[-1]}"] if chain else []
-        note = (
-            f"{', '.join(sorted(others)[:4])}: not taken for ground truth, which needs transforms from world to camera"
-        )
+        note = f"{', '.join(sorted(others)[:4])}: no ground truth, which takes transforms from world to the camera"
         return None, (note,) if others else ()
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     for rows in chain:
