@@ -410,6 +410,25 @@ def test_a_recording_that_broke_off_is_read_as_far_as_it_goes(tmp_path: Path, st
     assert any("breaks off" in each for each in problems(sequence))
 
 
+@pytest.mark.parametrize("storage", ["bag-lz4", "mcap-zstd"])
+def test_a_damaged_chunk_costs_its_frames_and_no_others(tmp_path: Path, storage: str) -> None:
+    path = place_for(tmp_path, storage)
+    with robot.recording(path, storage) as r:
+        r.camera(INFO, 10 * K, (10 * W, 10 * H))
+        for i in range(N):
+            noise = np.random.default_rng(i).integers(0, 255, (10 * H, 10 * W, 3), np.uint8)
+            r.image(COLOR, START + i, noise, "rgb8")
+            r.image(DEPTH, START + i, np.full((10 * H, 10 * W), 2000, np.uint16), "16UC1")
+    file = file_of(path)
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 200_000] = bytes(200_000)
+    file.write_bytes(data)
+    sequence = open_sequence(path)
+    assert N / 2 < len(sequence) < N
+    assert sequence.timestamps()[-1] == START + N - 1
+    assert any("1 chunks of" in each for each in problems(sequence))
+
+
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [

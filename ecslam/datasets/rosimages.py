@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import FrameError
-from .images import decode_color, decode_depth, parse_header, require_size, to_metres
+from .images import PNG_SIGNATURE, decode_color, decode_depth, parse_header, require_size, to_metres
 
 COLORS = {  # encoding: channels, and how OpenCV makes RGB of it
     "rgb8": (3, None),
@@ -30,7 +30,6 @@ COLORS = {  # encoding: channels, and how OpenCV makes RGB of it
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 GREY = ("mono8", "8UC1", "mono16")
 UNITS_PER_M = 1000.0
-PACKED_DEPTH = "compressedDepth"
 PACKED_HEADER = struct.Struct("<iff")
 
 
@@ -66,12 +65,11 @@ def kind_of(message: Any, place: str) -> ImageKind:
     frame = message.header.frame_id.strip("/")
     if hasattr(message, "encoding"):
         return ImageKind(message.width, message.height, message.encoding, False, "" if frame == "0" else frame)
-    encoding, _, packing = message.format.partition(";")
-    depth = PACKED_DEPTH in packing
-    header = parse_header(place, message.data[PACKED_HEADER.size if depth else 0 :].tobytes())
-    if not depth:
+    encoding, packed = _packed(message)
+    header = parse_header(place, message.data[PACKED_HEADER.size if packed else 0 :].tobytes())
+    if not packed:
         encoding = "bgr8" if header.bits == 8 and header.channels > 1 else "mono8" if header.bits == 8 else "16UC1"
-    return ImageKind(header.width, header.height, encoding.strip(), True, frame)
+    return ImageKind(header.width, header.height, encoding, True, frame)
 
 
 def color_of(message: Any, size: tuple[int, int], place: str) -> NDArray[np.uint8]:
@@ -113,18 +111,24 @@ def _rows(message: Any, kind: str, channels: int, size: tuple[int, int], place: 
 
 
 def _unpacked_depth(message: Any, size: tuple[int, int], place: str) -> NDArray[np.float32]:
-    encoding, _, packing = message.format.partition(";")
+    encoding, packed = _packed(message)
     data = message.data.tobytes()
-    if PACKED_DEPTH not in packing:
+    if not packed:
         return to_metres(decode_depth(place, data, size), UNITS_PER_M)
-    if len(data) < PACKED_HEADER.size:
-        raise FrameError(f"{place}: an empty image; record it again")
     _, a, b = PACKED_HEADER.unpack_from(data)
     raw = decode_depth(place, data[PACKED_HEADER.size :], size)
-    if encoding.strip() != "32FC1":
+    if encoding != "32FC1":
         return to_metres(raw, UNITS_PER_M)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return _known(np.where(raw > 0, np.float32(a) / (raw.astype(np.float32) - np.float32(b)), np.float32(0)))
+
+
+def _packed(message: Any) -> tuple[str, bool]:
+    """The encoding before compression, and whether the header of compressedDepth comes first; some tell neither."""
+    encoding, _, _ = message.format.partition(";")
+    at = PACKED_HEADER.size
+    packed = message.data[at : at + len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE
+    return encoding.strip() or "16UC1", packed
 
 
 def _known(depth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..types import InputError
+from .prefetch import workers
 from .rosfiles import SQLITE_ERRORS, ZSTD, Chunk, DamagedError, Place, exactly, open_sqlite, unpack, unpacked_message
 
 GLANCE = 192  # bytes of a record that are read in passing
@@ -44,14 +46,16 @@ def find_messages(files: list[Path], wanted: frozenset[str]) -> Index:
     for file in files:
         walk = walks[file.suffix](file, index, wanted)
         try:
-            walk.run()
-            index.lost += walk.notes()
+            with closing(walk):
+                walk.run()
         except OSError as error:
             raise InputError(f"{file}: cannot be read ({error.strerror})") from None
         except DamagedError as error:
             if not walk.topics:
                 raise InputError(f"{file}: {error}; copy or record it again") from None
             index.lost.append(f"{file.name} is damaged or breaks off ({error}): what comes before is read")
+        if walk.damaged_chunks:
+            index.lost.append(f"{walk.damaged_chunks} chunks of {file.name} are damaged and are left out")
     return index
 
 
@@ -62,16 +66,12 @@ class _Walk:
         self.file, self.index, self.wanted = file, index, wanted
         self.topics: dict[object, str] = {}
         self.damaged_chunks = 0
+        self._pool = ThreadPoolExecutor(workers())
+        self._coming: deque[tuple[Chunk, Future[bytes]]] = deque()
 
     def run(self) -> None:
         """Raises DamagedError, OSError."""
         raise NotImplementedError
-
-    def notes(self) -> list[str]:
-        """What was left out on the way."""
-        if not self.damaged_chunks:
-            return []
-        return [f"{self.damaged_chunks} chunks of {self.file.name} are damaged and are left out"]
 
     def topic(self, connection: object, name: str, kind: str) -> None:
         package, _, rest = kind.partition("/")
@@ -82,12 +82,22 @@ class _Walk:
         return self.index.types.get(self.topics.get(connection, "")) in self.wanted
 
     def packed(self, data: bytes, chunk: Chunk) -> None:
-        """The records of a compressed chunk; a damaged one costs no other."""
-        try:
-            data = unpack(data, chunk.packing, chunk.full)
-            self.records(BytesIO(data), 0, len(data), chunk, inside=True)
-        except DamagedError:
-            self.damaged_chunks += 1
+        """The records of a compressed chunk, later: threads unpack. A damaged one costs no other."""
+        self._coming.append((chunk, self._pool.submit(unpack, data, chunk.packing, chunk.full)))
+        self._walk_chunks(2 * workers())
+
+    def close(self) -> None:
+        """Walk over the last chunks."""
+        self._walk_chunks(0)
+        self._pool.shutdown()
+
+    def _walk_chunks(self, left: int) -> None:
+        while len(self._coming) > left:
+            chunk, data = self._coming.popleft()
+            try:
+                self.records(BytesIO(data.result()), 0, chunk.full, chunk, inside=True)
+            except DamagedError:
+                self.damaged_chunks += 1
 
     def records(self, stream: BinaryIO, at: int, end: int, chunk: Chunk | None = None, inside: bool = False) -> None:
         """Those from ``at`` to ``end``, of the file or of ``chunk``. Raises DamagedError."""
