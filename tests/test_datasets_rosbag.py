@@ -376,6 +376,14 @@ def test_poses_of_something_else_are_no_ground_truth_and_a_note_says_so(tmp_path
     assert any("transforms from world: no ground truth" in each for each in problems(sequence))
 
 
+def test_a_camera_that_hangs_on_two_frames_has_no_ground_truth(tmp_path: Path) -> None:
+    def both(r: Robot) -> None:
+        for parent in ("world", "gripper"):
+            r.transform(START, parent, CAMERA, np.eye(4))
+
+    assert open_sequence(write(tmp_path / "room", "mcap", both)).poses_gt() is None
+
+
 def test_a_static_link_is_known_at_all_times_and_a_moving_one_only_nearby(tmp_path: Path) -> None:
     mount, there = np.eye(4), np.eye(4)
     mount[:3, 3], there[0, 3] = [0, 0, 1], 5

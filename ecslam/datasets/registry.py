@@ -89,7 +89,7 @@ def _resolve(address: str) -> Path:
 def _open_path(path: Path, options: dict[str, str]) -> Sequence:
     if not path.exists():
         raise InputError(
-            f"{path}: no such folder; give the folder of a sequence, or {SYNTHETIC}studio for a built-in room"
+            f"{path}: no such folder or file; give the folder of a sequence, or {SYNTHETIC}studio for a built-in room"
         )
     layout = _recognise(path)
     if layout is None:

@@ -76,6 +76,7 @@ def open(path: Path, color: str = "", depth: str = "") -> RosRecording:
         )
     times = depth_times[pairs[:, 1]]
     poses, pose_notes = true_poses(recording, color_topic.kind.frame, times)
+    recording.places.clear()  # hundreds of bytes for each transform
     dropped = len(color_times) - len(pairs), len(depth_times) - len(pairs)
     unpaired = f"{dropped[0]} colour and {dropped[1]} depth images have no partner within 20 ms and are left out"
     return RosRecording(

@@ -94,7 +94,7 @@ def exactly(stream: BinaryIO, at: int, size: int) -> bytes:
 
 def open_sqlite(file: Path) -> sqlite3.Connection:
     """Read only; nothing is written beside it."""
-    return sqlite3.connect(f"{file.resolve().as_uri()}?immutable=1", uri=True)
+    return sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)
 
 
 def _row(place: Place) -> bytes:

@@ -20,7 +20,7 @@ MOST_LISTED = 12
 LENSES = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}  # how many numbers they take, in OpenCV's order
 NO_DISTORTION: tuple[float, ...] = ()
 HOW_TO_CHOOSE = "say which with ?color=/TOPIC&depth=/TOPIC after the path"
-HOW_TO_RECORD = "record depth as seen by the colour camera (align_depth for RealSense, depth_registration elsewhere)"
+HOW_TO_RECORD = "record with align_depth.enable:=true (RealSense) or depth_registration:=true (others)"
 
 
 class Topic(NamedTuple):
