@@ -48,18 +48,9 @@ class Topic(NamedTuple):
 def choose(recording: Recording, color: str, depth: str) -> tuple[Topic, Topic]:
     """The topics of colour and of depth registered to it. color, depth: as the user says, or "". Raises InputError."""
     topics, unreadable = _image_topics(recording)
-    for asked in filter(None, (color, depth)):
-        if asked not in (topic.name for topic in topics):
-            reason = unreadable.get(asked, f"no images are recorded under {asked}; there {_listed(topics)}")
-            raise InputError(f"{recording.path}: {reason}")
-    colors = [t for t in topics if t.name == color or (not color and t.kind.is_color)]
-    depths = [t for t in topics if t.name == depth or (not depth and t.kind.is_depth and not _infrared(t))]
-    for what, found in (("colour", colors), ("depth", depths)):
-        if not found:
-            reasons = "".join(f"; {reason}" for reason in [*recording.lost, *unreadable.values()][:1])
-            raise InputError(
-                f"{recording.path}: no {what} images among its topics ({_listed(topics)}){reasons}; record them too"
-            )
+    colors = _candidates(recording, "colour", color, [t for t in topics if t.kind.is_color], topics, unreadable)
+    distances = [t for t in topics if t.kind.is_depth and (t.name == depth or not _infrared(t))]
+    depths = _candidates(recording, "depth", depth, distances, topics, unreadable)
     pairs = list(product(colors, depths))
     if not (color and depth):
         pairs = _registered(pairs)
@@ -73,11 +64,29 @@ def choose(recording: Recording, color: str, depth: str) -> tuple[Topic, Topic]:
     return _best(pairs, recording)
 
 
+def _candidates(
+    recording: Recording, what: str, asked: str, fit: list[Topic], topics: list[Topic], unreadable: dict[str, str]
+) -> list[Topic]:
+    """Of the topics that ``fit``, the one asked for, or all. Raises InputError when there is none."""
+    found = [topic for topic in fit if asked in ("", topic.name)]
+    if found:
+        return found
+    there = f"its topics of images {_listed(topics)}"
+    if asked in unreadable:
+        reason = unreadable[asked]
+    elif asked:
+        reason = f"{asked} is no topic with {what} images; {there}"
+    else:
+        reason = "; ".join([f"no {what} images: {there}", *[*recording.lost, *unreadable.values()][:1]])
+    raise InputError(f"{recording.path}: {reason}; choose another, or record it again")
+
+
 def camera_of(recording: Recording, color: Topic, depth: Topic) -> tuple[Intrinsics, tuple[str, ...]]:
     """The camera of the images at the size of depth, and notes. Raises InputError."""
     folder = recording.path if recording.path.is_dir() else recording.path.parent
     if (folder / INTRINSICS_FILE).is_file():
-        return read_intrinsics(folder / INTRINSICS_FILE, *depth.kind.size), ()
+        note = f"the camera is that of {INTRINSICS_FILE}, without distortion"
+        return read_intrinsics(folder / INTRINSICS_FILE, *depth.kind.size), (note,)
     infos = recording.of_type(CAMERA_INFO)
     wanted = [f"{topic.base.rpartition('/')[0]}/camera_info" for topic in (color, depth)]
     name = next((each for each in wanted if each in infos), None)
@@ -136,7 +145,7 @@ def _best(pairs: list[tuple[Topic, Topic]], recording: Recording) -> tuple[Topic
 def _listed(topics: list[Topic]) -> str:
     names = [f"{topic.name} {topic.kind.encoding}" for topic in topics]
     more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
-    return f"are {', '.join(names[:MOST_LISTED])}{more}" if names else "are no images at all"
+    return f"are {', '.join(names[:MOST_LISTED])}{more}" if names else "are none"
 
 
 def _camera(info: Any, color: Topic, depth: Topic, place: str) -> Intrinsics:
