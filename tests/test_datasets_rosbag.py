@@ -271,6 +271,14 @@ def test_without_depth_or_colour_it_says_what_there_is(tmp_path: Path) -> None:
         open_sequence(tmp_path / "c.bag")
 
 
+def test_what_a_recording_calls_its_topics_stays_on_one_line(tmp_path: Path) -> None:
+    with robot.recording(tmp_path / "room.bag") as r:
+        r.image("/a\n\x1b[31mb", START, picture(0), "rgb\n8", frame="c\nd")
+    with pytest.raises(InputError, match=r"/a\?\?\[31mb rgb\?8") as caught:
+        open_sequence(tmp_path / "room.bag")
+    assert str(caught.value).isprintable()
+
+
 # ---- the camera ----
 
 

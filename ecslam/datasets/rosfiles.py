@@ -92,6 +92,11 @@ def exactly(stream: BinaryIO, at: int, size: int) -> bytes:
     return data
 
 
+def printable(text: str) -> str:
+    """What a file says, for a message of one line."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
 def open_sqlite(file: Path) -> sqlite3.Connection:
     """Read only; nothing is written beside it."""
     return sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)
@@ -102,7 +107,7 @@ def _row(place: Place) -> bytes:
         with closing(open_sqlite(place.file)) as database:
             row = database.execute("SELECT data FROM messages WHERE id = ?", (place.at,)).fetchone()
     except SQLITE_ERRORS as error:
-        raise DamagedError(f"a damaged database ({error})") from None
+        raise DamagedError(f"a damaged database ({printable(str(error))})") from None
     if row is None or not isinstance(row[0], bytes):
         raise DamagedError("a message is gone")
     return row[0]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..types import FrameError
 from .images import PNG_SIGNATURE, decode_color, decode_depth, parse_header, require_size, to_metres
+from .rosfiles import printable
 
 COLORS = {  # encoding: channels, and how OpenCV makes RGB of it
     "rgb8": (3, None),
@@ -30,6 +31,7 @@ COLORS = {  # encoding: channels, and how OpenCV makes RGB of it
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 GREY = ("mono8", "8UC1", "mono16")
 UNITS_PER_M = 1000.0
+UNNAMED = "0"  # the frame of all images that RealSense's own viewer records, depth not registered
 PACKED_HEADER = struct.Struct("<iff")
 
 
@@ -62,9 +64,10 @@ class ImageKind:
 
 def kind_of(message: Any, place: str) -> ImageKind:
     """Of an Image or CompressedImage. place: where it is from, for messages. Raises FrameError."""
-    frame = message.header.frame_id.strip("/")
+    frame = printable(message.header.frame_id.strip("/"))
+    frame = "" if frame == UNNAMED else frame
     if hasattr(message, "encoding"):
-        return ImageKind(message.width, message.height, message.encoding, False, "" if frame == "0" else frame)
+        return ImageKind(message.width, message.height, printable(message.encoding), False, frame)
     encoding, packed = _packed(message)
     header = parse_header(place, message.data[PACKED_HEADER.size if packed else 0 :].tobytes())
     if not packed:
@@ -128,7 +131,7 @@ def _packed(message: Any) -> tuple[str, bool]:
     encoding, _, _ = message.format.partition(";")
     at = PACKED_HEADER.size
     packed = message.data[at : at + len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE
-    return encoding.strip() or "16UC1", packed
+    return printable(encoding.strip()) or "16UC1", packed
 
 
 def _known(depth: NDArray[np.float32]) -> NDArray[np.float32]:

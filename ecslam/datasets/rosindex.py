@@ -20,7 +20,18 @@ from typing import Any, BinaryIO
 
 from ..types import InputError
 from .prefetch import workers
-from .rosfiles import SQLITE_ERRORS, ZSTD, Chunk, DamagedError, Place, exactly, open_sqlite, unpack, unpacked_message
+from .rosfiles import (
+    SQLITE_ERRORS,
+    ZSTD,
+    Chunk,
+    DamagedError,
+    Place,
+    exactly,
+    open_sqlite,
+    printable,
+    unpack,
+    unpacked_message,
+)
 
 GLANCE = 192  # bytes of a record that are read in passing
 MOST_ABOUT_BYTES = 16 << 20  # of what describes a topic
@@ -75,7 +86,7 @@ class _Walk:
 
     def topic(self, connection: object, name: str, kind: str) -> None:
         package, _, rest = kind.partition("/")
-        self.topics[connection] = name
+        name = self.topics[connection] = printable(name)
         self.index.types[name] = f"{package}/msg/{rest.removeprefix('msg/')}"
 
     def wants(self, connection: object) -> bool:
@@ -132,8 +143,9 @@ class _BagWalk(_Walk):
             if at + size > end:
                 raise DamagedError("its last record is cut off")
             if kind == b"\x02" and self.wants(connection):
-                seconds, rest = struct.unpack("<II", fields[b"time"])
-                self.message(connection, 10**9 * seconds + rest, chunk, at, size, start)
+                seconds, rest = fields[b"time"][:4], fields[b"time"][4:]
+                time_ns = 10**9 * int.from_bytes(seconds, "little") + int.from_bytes(rest, "little")
+                self.message(connection, time_ns, chunk, at, size, start)
             at += size
 
     def _chunk(self, stream: BinaryIO, at: int, size: int, end: int, fields: dict[bytes, bytes]) -> None:
@@ -265,7 +277,7 @@ class _SqliteWalk(_Walk):
                     for row, time_ns, size, start in _rows(database, number):
                         self.message(number, time_ns, None, row, size, start)
         except SQLITE_ERRORS as error:
-            raise DamagedError(f"a damaged database: {error}") from None
+            raise DamagedError(f"a damaged database: {printable(str(error))}") from None
 
 
 def _rows(database: sqlite3.Connection, topic: object) -> Iterator[tuple[int, int, int, bytes]]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..types import FrameError, InputError
-from .rosfiles import Place, Reader
+from .rosfiles import Place, Reader, printable
 from .rosindex import find_messages
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -43,4 +43,6 @@ class Recording:
         try:
             return self._decode(data, TRANSFORMS if kind == OLD_TRANSFORMS else kind)
         except Exception as error:  # whatever damaged bytes lead to
-            raise FrameError(f"{self.path}: a damaged message of {topic} ({error}); record it again") from None
+            raise FrameError(
+                f"{self.path}: a damaged message of {topic} ({printable(str(error))}); record it again"
+            ) from None

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..indices import evenly
 from ..types import FrameError
 from .reading import rigid
+from .rosfiles import printable
 from .rosmessages import OLD_TRANSFORMS, TRANSFORMS, Recording
 from .tum import MAX_DIFFERENCE_S, interpolate_poses
 
@@ -44,7 +45,7 @@ def true_poses(
 
 def _why_none(recording: Recording, frames: list[str]) -> tuple[str, ...]:
     others = sorted(topic for topic, kind in recording.types.items() if kind in POSES)
-    others += [f"transforms from {frames[-1]}"] if len(frames) > 1 else []
+    others += [f"transforms from {printable(frames[-1])}"] if len(frames) > 1 else []
     note = f"{', '.join(others[-4:])}: no ground truth, which takes transforms from world to the camera"
     return (note,) if others else ()
 
