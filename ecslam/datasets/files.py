@@ -46,14 +46,18 @@ class FileSequence:
         if not (k.fx > 0 and k.fy > 0 and 0 <= k.cx < k.width and 0 <= k.cy < k.height):
             values = f"fx {k.fx:g}, fy {k.fy:g}, cx {k.cx:g}, cy {k.cy:g}"
             raise InputError(
-                f"{self.depth_files[0].parent}: the intrinsics ({values}) do not fit {k.width}x{k.height} images; "
+                f"{self._place()}: the intrinsics ({values}) do not fit {k.width}x{k.height} images; "
                 "focal lengths must be positive and the centre inside the image"
             )
         if not 0 < self.depth_scale < np.inf:
-            raise InputError(f"{self.depth_files[0].parent}: depth scale {self.depth_scale:g} is not a positive number")
+            raise InputError(f"{self._place()}: depth scale {self.depth_scale:g} is not a positive number")
+
+    def _place(self) -> Path:
+        """Where it lies, for messages."""
+        return self.depth_files[0].parent
 
     def __len__(self) -> int:
-        return len(self.depth_files)
+        return len(self.times)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[i] for i in range(len(self)))
@@ -80,15 +84,25 @@ class FileSequence:
     def _images(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour [H, W, 3] and depth [H, W] of a frame. Raises FrameError."""
         size = (self.intrinsics.width, self.intrinsics.height)
-        color: NDArray[Any] = read_color(self.color_files[index], self.color_size)
-        raw: NDArray[Any] = read_depth(self.depth_files[index], size)
+        color: NDArray[Any]
+        raw: NDArray[Any]
+        color, raw = self._stored(index, size)
         if self.color_size != size:
             color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-        if self.intrinsics.distortion:
-            fixed, fraction, rounded = self._undistortion
-            color = cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR)
-            raw = cv2.remap(raw, rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
+        color, raw = self._undistorted(color, raw)
         return color, fill_pinholes(to_metres(raw, self.depth_scale))
+
+    def _undistorted(self, color: NDArray[Any], depth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Both images without what the lens does to them."""
+        if not self.intrinsics.distortion:
+            return color, depth
+        fixed, fraction, rounded = self._undistortion
+        flat = cv2.remap(depth, rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
+        return cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR), flat
+
+    def _stored(self, index: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """Colour at ``color_size`` and depth at ``size`` (width, height) as the files have them. Raises FrameError."""
+        return read_color(self.color_files[index], self.color_size), read_depth(self.depth_files[index], size)
 
     def _pose(self, index: int) -> NDArray[np.float64] | None:
         if self.poses is None or not np.isfinite(self.poses[index]).all():

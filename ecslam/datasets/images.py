@@ -52,30 +52,41 @@ class ImageHeader:
 
 def read_header(path: Path) -> ImageHeader:
     """The header of a PNG or JPEG file, from its first bytes. Raises FrameError."""
-    return _parse_header(path, read_bytes(path, HEADER_BYTES))
+    return parse_header(path, read_bytes(path, HEADER_BYTES))
 
 
 def read_color(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     """An 8-bit image as RGB uint8 [H, W, 3]. size: the (width, height) it must have. Raises FrameError."""
-    data, header = _read_checked(path, size)
+    return decode_color(path, read_bytes(path, _most_bytes(size) + 1), size)
+
+
+def decode_color(place: Path | str, data: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """As ``read_color``, from the bytes of a PNG or JPEG file. place: where they are from, for messages."""
+    header = _check(place, data, size)
     if header.bits != 8:
         raise FrameError(
-            f"{path}: a {header.bits}-bit {header.kind}, but colour must have 8 bits; is it a depth image?"
+            f"{place}: a {header.bits}-bit {header.kind}, but colour must have 8 bits; is it a depth image?"
         )
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cast("NDArray[np.uint8]", _decode(path, data, flags, (size[1], size[0], 3), np.uint8))
+    image = cast("NDArray[np.uint8]", _decode(place, data, flags, (size[1], size[0], 3), np.uint8))
     cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
     return image
 
 
 def read_depth(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
     """A 16-bit grey PNG, values as stored, uint16 [H, W]. size: the (width, height) it must have. Raises FrameError."""
-    return cast("NDArray[np.uint16]", _read_grey(path, size, "depth", np.uint16))
+    return decode_depth(path, read_bytes(path, _most_bytes(size) + 1), size)
+
+
+def decode_depth(place: Path | str, data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]:
+    """As ``read_depth``, from the bytes of a PNG file. place: where they are from, for messages."""
+    return cast("NDArray[np.uint16]", _decode_grey(place, data, size, "depth", np.uint16))
 
 
 def read_levels(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     """An 8-bit grey PNG, values as stored, uint8 [H, W]. size: the (width, height) it must have. Raises FrameError."""
-    return cast("NDArray[np.uint8]", _read_grey(path, size, "confidence", np.uint8))
+    data = read_bytes(path, _most_bytes(size) + 1)
+    return cast("NDArray[np.uint8]", _decode_grey(path, data, size, "confidence", np.uint8))
 
 
 def to_metres(raw: NDArray[np.uint16], scale: float) -> NDArray[np.float32]:
@@ -98,34 +109,37 @@ def fill_pinholes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(filled, np.float32(0.5) * (far + near), depth)
 
 
-def _read_grey(path: Path, size: tuple[int, int], what: str, kind: type) -> NDArray[np.generic]:
-    data, header = _read_checked(path, size)
+def _decode_grey(place: Path | str, data: bytes, size: tuple[int, int], what: str, kind: type) -> NDArray[np.generic]:
+    header = _check(place, data, size)
     bits = 8 * np.dtype(kind).itemsize
     if (header.kind, header.bits, header.channels) != ("PNG", bits, 1):
         found = f"{header.bits}-bit {header.kind} with {header.channels} channels"
         raise FrameError(
-            f"{path}: a {found}, but {what} must be a {bits}-bit PNG with one; export it again without conversion"
+            f"{place}: a {found}, but {what} must be a {bits}-bit PNG with one; export it again without conversion"
         )
-    return _decode(path, data, cv2.IMREAD_UNCHANGED, (size[1], size[0]), kind)
+    return _decode(place, data, cv2.IMREAD_UNCHANGED, (size[1], size[0]), kind)
 
 
-def _read_checked(path: Path, size: tuple[int, int]) -> tuple[bytes, ImageHeader]:
-    """The bytes of a complete image of the wanted size, still encoded."""
-    limit = (1 << 20) + 8 * size[0] * size[1]
-    data = read_bytes(path, limit + 1)
-    header = _parse_header(path, data)
-    require_size(path, header.size, size)
+def _most_bytes(size: tuple[int, int]) -> int:
+    """More than a sensible image of this (width, height) takes."""
+    return (1 << 20) + 8 * size[0] * size[1]
+
+
+def _check(place: Path | str, data: bytes, size: tuple[int, int]) -> ImageHeader:
+    """The header of what must be a complete image of the wanted size, still encoded."""
+    header, limit = parse_header(place, data), _most_bytes(size)
+    require_size(place, header.size, size)
     if len(data) > limit:
-        raise FrameError(f"{path}: over {limit >> 20} MiB, too much for {_by(size)} pixels; replace it")
+        raise FrameError(f"{place}: over {limit >> 20} MiB, too much for {_by(size)} pixels; replace it")
     if LAST_BYTES[header.kind] not in data[-64:]:
-        raise FrameError(f"{path}: truncated {header.kind} (no end marker); copy it again")
-    return data, header
+        raise FrameError(f"{place}: truncated {header.kind} (no end marker); copy it again")
+    return header
 
 
-def require_size(path: Path, found: tuple[int, int], size: tuple[int, int]) -> None:
+def require_size(place: Path | str, found: tuple[int, int], size: tuple[int, int]) -> None:
     """Raises FrameError when an image of (width, height) ``found`` is not of the sequence's ``size``."""
     if found != size:
-        raise FrameError(f"{path}: {_by(found)} pixels, but this sequence has {_by(size)}; remove or replace it")
+        raise FrameError(f"{place}: {_by(found)} pixels, but this sequence has {_by(size)}; remove or replace it")
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
@@ -142,15 +156,16 @@ def read_bytes(path: Path, limit: int) -> bytes:
     return data
 
 
-def _parse_header(path: Path, data: bytes) -> ImageHeader:
+def parse_header(place: Path | str, data: bytes) -> ImageHeader:
+    """The header of a PNG or JPEG file, from its first bytes. place: where they are from. Raises FrameError."""
     if data.startswith(PNG_SIGNATURE):
         header = _png_header(data)
     elif data.startswith(JPEG_SIGNATURE):
         header = _jpeg_header(data)
     else:
-        raise FrameError(f"{path}: neither PNG nor JPEG; convert it to one of them")
+        raise FrameError(f"{place}: neither PNG nor JPEG; convert it to one of them")
     if header is None or header.width < 1 or header.height < 1:
-        raise FrameError(f"{path}: damaged or truncated header; copy it again")
+        raise FrameError(f"{place}: damaged or truncated header; copy it again")
     return header
 
 
@@ -181,13 +196,13 @@ def _jpeg_header(data: bytes) -> ImageHeader | None:
     return None
 
 
-def _decode(path: Path, data: bytes, flags: int, shape: tuple[int, ...], dtype: type) -> NDArray[np.generic]:
+def _decode(place: Path | str, data: bytes, flags: int, shape: tuple[int, ...], dtype: type) -> NDArray[np.generic]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None or image.shape != shape or image.dtype != dtype:
-        raise FrameError(f"{path}: cannot be decoded; copy it again")
+        raise FrameError(f"{place}: cannot be decoded; copy it again")
     return cast("NDArray[np.generic]", image)
 
 

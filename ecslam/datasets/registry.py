@@ -1,6 +1,7 @@
 """From a path or an address to a sequence. Layouts are the modules of this folder that have ``sniff`` and ``open``.
 
 A new layout is one new file: its docstring's first line says, after the name and a colon, what the folder must hold.
+Where a single file can be a sequence, ``FILES`` has the endings of its name; ``open`` then takes its path, too.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def open_sequence(path_or_address: str | Path, **synthetic_options: Any) -> Sequ
             f"{address}: {', '.join(synthetic_options)} can be set for {SYNTHETIC}... only, not for a folder"
         )
     try:
-        return _open_folder(_resolve(address))
+        return _open_path(_resolve(address))
     except OSError as error:
         raise InputError(f"{address}: cannot be opened ({error.strerror}); give a readable folder") from None
 
@@ -71,19 +72,20 @@ def _resolve(address: str) -> Path:
         raise InputError(f"{address!r}: not a path ({error}); give the folder of a sequence") from None
 
 
-def _open_folder(folder: Path) -> Sequence:
+def _open_path(folder: Path) -> Sequence:
     if not folder.exists():
         raise InputError(
-            f"{folder}: no such folder; give the folder of a sequence, or {SYNTHETIC}studio for a built-in room"
+            f"{folder}: no such folder or file; give the folder of a sequence, or {SYNTHETIC}studio for a built-in room"
         )
-    if not folder.is_dir():
-        raise InputError(f"{folder}: a file; give the folder that holds the sequence")
-    names = sorted(p.name for p in folder.iterdir())
-    if not names:
-        raise InputError(f"{folder}: an empty folder; give a folder that holds a sequence")
     layout = _recognise(folder)
     if layout is not None:
         return layout.open(folder)
+    if not folder.is_dir():
+        known = ", ".join(endings())
+        raise InputError(f"{folder}: a file, but of those only {known} are sequences; give the folder that holds yours")
+    names = sorted(p.name for p in folder.iterdir())
+    if not names:
+        raise InputError(f"{folder}: an empty folder; give a folder that holds a sequence")
     inside = next((p for p in sorted(folder.iterdir())[:100] if looks_like_one(p)), None)
     if inside is not None:
         raise InputError(f"{folder}: not a sequence itself; did you mean {inside}?")
@@ -92,13 +94,27 @@ def _open_folder(folder: Path) -> Sequence:
     raise InputError(f"{folder}: no known layout (it holds {found}); rearrange it as one of these: {known}")
 
 
-def looks_like_one(folder: Path) -> bool:
-    """Whether a sequence seems to lie in ``folder``, by file names alone; not where those cannot be read."""
+def looks_like_one(path: Path) -> bool:
+    """Whether a sequence seems to lie in the folder, or to be the file, by names alone; not where those cannot be
+    read."""
     try:
-        return folder.is_dir() and _recognise(folder) is not None
+        return _recognise(path) is not None
     except OSError:
         return False
 
 
-def _recognise(folder: Path) -> Layout | None:
-    return next((layout for layout in layouts() if layout.sniff(folder)), None)
+def endings() -> tuple[str, ...]:
+    """Of the names of files that are sequences by themselves, in lower case."""
+    return sum((_endings(layout) for layout in layouts()), ())
+
+
+def _recognise(path: Path) -> Layout | None:
+    if path.is_dir():
+        return next((layout for layout in layouts() if layout.sniff(path)), None)
+    if path.is_file():
+        return next((layout for layout in layouts() if path.name.lower().endswith(_endings(layout))), None)
+    return None
+
+
+def _endings(layout: Layout) -> tuple[str, ...]:
+    return cast("tuple[str, ...]", getattr(layout, "FILES", ()))
