@@ -1,7 +1,7 @@
 """From a path or an address to a sequence. Layouts are the modules of this folder that have ``sniff`` and ``open``.
 
 A new layout is one new file: its docstring's first line says, after the name and a colon, what the folder must hold.
-Where a single file can be a sequence, ``FILES`` has the endings of its name; ``open`` then takes its path, too.
+Where a single file can be a sequence, ``SUFFIXES`` are those of such files; ``sniff`` and ``open`` take its path, too.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Layout(Protocol):
     __doc__: str | None
 
     def sniff(self, path: Path) -> bool:
-        """Whether the folder ``path`` is laid out this way, from file names only."""
+        """Whether ``path``, mostly a folder, is laid out this way, from file names only."""
 
     def open(self, path: Path) -> Sequence:
         """Open it. Raises InputError when something is wrong with it."""
@@ -81,8 +81,8 @@ def _open_path(folder: Path) -> Sequence:
     if layout is not None:
         return layout.open(folder)
     if not folder.is_dir():
-        known = ", ".join(endings())
-        raise InputError(f"{folder}: a file, but of those only {known} are sequences; give the folder that holds yours")
+        known = ", ".join(sorted(suffixes()))
+        raise InputError(f"{folder}: a file, and not one of {known}; give the folder that holds the sequence")
     names = sorted(p.name for p in folder.iterdir())
     if not names:
         raise InputError(f"{folder}: an empty folder; give a folder that holds a sequence")
@@ -103,18 +103,12 @@ def looks_like_one(path: Path) -> bool:
         return False
 
 
-def endings() -> tuple[str, ...]:
-    """Of the names of files that are sequences by themselves, in lower case."""
-    return sum((_endings(layout) for layout in layouts()), ())
+def suffixes() -> frozenset[str]:
+    """Of files that may be sequences, in lower case."""
+    return frozenset(suffix for layout in layouts() for suffix in getattr(layout, "SUFFIXES", ()))
 
 
 def _recognise(path: Path) -> Layout | None:
-    if path.is_dir():
-        return next((layout for layout in layouts() if layout.sniff(path)), None)
-    if path.is_file():
-        return next((layout for layout in layouts() if path.name.lower().endswith(_endings(layout))), None)
-    return None
-
-
-def _endings(layout: Layout) -> tuple[str, ...]:
-    return cast("tuple[str, ...]", getattr(layout, "FILES", ()))
+    if not path.is_dir() and path.suffix.lower() not in suffixes():
+        return None
+    return next((layout for layout in layouts() if layout.sniff(path)), None)

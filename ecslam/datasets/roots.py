@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 from ..types import InputError
-from .registry import endings, looks_like_one
+from .registry import looks_like_one, suffixes
 
 DEEPEST, MOST_PLACES = 3, 2000
 
@@ -33,13 +33,14 @@ def _places(path: Path, deeper: int) -> Iterator[Path]:
     yield path
     if deeper == 0 or looks_like_one(path):
         return
+    files = suffixes()
     try:
-        inside = sorted(entry.path for entry in os.scandir(path) if _worth_a_look(entry))
+        inside = sorted(
+            entry.path
+            for entry in os.scandir(path)
+            if entry.name[0] != "." and (entry.is_dir() or Path(entry.name).suffix.lower() in files)
+        )
     except OSError:
         return
     for each in inside:
         yield from _places(Path(each), deeper - 1)
-
-
-def _worth_a_look(entry: os.DirEntry[str]) -> bool:
-    return entry.name[0] != "." and (entry.is_dir() or entry.name.lower().endswith(endings()))

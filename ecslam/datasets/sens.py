@@ -24,7 +24,7 @@ from .images import decode_color
 from .reading import MAX_PIXELS, finite_poses, rigid, same_shape
 from .scannet import find_mesh
 
-FILES = (".sens",)
+SUFFIXES = (".sens",)
 VERSION = 4
 FRAMES_PER_S = 30.0
 MOST_NAME_BYTES = 4096
@@ -63,8 +63,8 @@ FRAME = np.dtype(
 
 
 def sniff(path: Path) -> bool:
-    """Whether the folder holds one .sens file."""
-    return len(_files(path)) == 1
+    """Whether it is a .sens file, or a folder that holds one."""
+    return _is_stream(path) or (path.is_dir() and len(_streams(path)) == 1)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -95,7 +95,7 @@ class SensorStream(FileSequence):
 
 def open(path: Path) -> SensorStream:
     """Open the file, or the folder that holds it; looks at the fixed part of each frame. Raises InputError."""
-    file = _files(path)[0] if path.is_dir() else path
+    file = _streams(path)[0] if path.is_dir() else path
     with file.open("rb", buffering=0) as stream:
         header = _read_header(stream, file)
         starts, frames = _walk(stream, file, int(header["frames"]))
@@ -122,8 +122,12 @@ def open(path: Path) -> SensorStream:
     )
 
 
-def _files(folder: Path) -> list[Path]:
-    return sorted(each for each in folder.iterdir() if each.suffix.lower() in FILES and each.is_file())
+def _streams(folder: Path) -> list[Path]:
+    return [each for each in folder.iterdir() if _is_stream(each)]
+
+
+def _is_stream(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
 def _read_header(stream: BinaryIO, file: Path) -> Any:
