@@ -35,8 +35,8 @@ def _place(option: typer.CallbackParam, file: Path | None) -> Path | None:
 SequenceArgument = Annotated[
     str,
     typer.Argument(
-        help="A folder (7-Scenes, TUM RGB-D, Replica, ScanNet ..., recognised by itself), a .sens file or a built-in "
-        "room: synthetic/studio, synthetic/apartment, synthetic/corridor."
+        help="A folder (7-Scenes, TUM RGB-D, Replica, ScanNet ..., recognised by itself), a .sens or .r3d file, or a "
+        "built-in room: synthetic/studio, synthetic/apartment, synthetic/corridor."
     ),
 ]
 Preset = Annotated[str | None, typer.Option(help="lite, full, live, scannet or tum; default: what suits the layout.")]

@@ -143,6 +143,19 @@ def write_sens(root: Path) -> Path:
     return root
 
 
+def write_record3d(root: Path) -> Path:
+    """Colour four times as fine as frames, depth half as fine."""
+    pytest.importorskip("lzfse")
+    import phone_video
+
+    matrix = np.array([[4 * K[0, 0], 0, 4 * K[0, 2] + 1.5], [0, 4 * K[1, 1], 4 * K[1, 2] + 1.5], [0, 0, 1]])
+    depth = depth_values(1000)[: H // 2, : W // 2] / np.float32(1000)
+    depth[0, :2] = 0, np.nan
+    poses = [pose(i) for i in range(N)]
+    colors = [picture(i, 4 * W, 4 * H) for i in range(N)]
+    return phone_video.write(root, phone_video.parts(colors, [depth] * N, poses, matrix))
+
+
 def write_neuralrgbd(root: Path) -> Path:
     poses = []
     for i in range(N):
@@ -163,6 +176,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "stray": write_stray,
     "neuralrgbd": write_neuralrgbd,
     "sens": write_sens,
+    "record3d": write_record3d,
 }
 PRESETS = {"tum": "tum", "scannet": "scannet", "sens": "scannet"}
 
@@ -317,7 +331,7 @@ def test_the_error_for_an_unknown_folder_lists_every_layout(tmp_path: Path) -> N
         open_sequence(tmp_path)
     assert all(
         name in str(caught.value)
-        for name in ("7-Scenes", "TUM", "NICE-SLAM", "vMAP", "ScanNet", ".sens", "Stray", "Neural")
+        for name in ("7-Scenes", "TUM", "NICE-SLAM", "vMAP", "ScanNet", ".sens", "Stray", "Neural", "Record3D")
     )
 
 
