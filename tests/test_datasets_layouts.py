@@ -420,6 +420,40 @@ def test_wrong_intrinsics_are_refused(tmp_path: Path, text: str, says: str) -> N
         open_sequence(tmp_path)
 
 
+INFO = """m_versionNumber = 4
+m_sensorName = StructureSensor
+m_colorWidth = 640
+m_colorHeight = 480
+m_depthWidth = 640
+m_depthHeight = 480
+m_depthShift = 1000
+m_calibrationColorIntrinsic = 583 0 321 0 0 583 241 0 0 0 1 0 0 0 0 1 
+m_calibrationDepthIntrinsic = 582.871 0 320 0 0 582.87 240 0 0 0 1 0 0 0 0 1 
+m_frames.size = 6
+"""
+
+
+@pytest.mark.parametrize("name", ["info.txt", "_info.txt"])
+def test_a_recording_of_bundlefusion_brings_its_camera(tmp_path: Path, name: str) -> None:
+    root = write_7scenes(tmp_path / "apt0")
+    (root / name).write_text(INFO)
+    assert open_sequence(root).intrinsics.fx == 60
+    (root / "camera-intrinsics.txt").unlink()
+    k = open_sequence(root).intrinsics
+    assert (k.fx, k.fy, k.cx, k.cy, k.width) == pytest.approx((58.2871, 58.287, 31.55, 23.55, 64))
+
+
+@pytest.mark.parametrize(("old", "new"), [("582.871", "?"), ("640", "0"), ("m_depthWidth", "width")])
+def test_a_camera_that_bundlefusion_does_not_tell_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    root = write_7scenes(tmp_path / "apt0")
+    (root / "camera-intrinsics.txt").unlink()
+    (root / "info.txt").write_text(INFO.replace(old, new))
+    with pytest.raises(InputError, match=r"info\.txt: tells no camera"):
+        open_sequence(root)
+    (root / "info.txt").write_text("a kitchen, on Monday\n")
+    assert open_sequence(root).intrinsics.fx == 58.5
+
+
 @pytest.mark.parametrize("text", ["inf " * 16, "-inf " * 16, "nan " * 16, "1 2", "", "hello", "2 " * 16])
 def test_a_bad_pose_is_no_pose_and_is_counted(tmp_path: Path, text: str) -> None:
     (write_scannet(tmp_path) / "pose/2.txt").write_text(text)
