@@ -35,8 +35,8 @@ def _place(option: typer.CallbackParam, file: Path | None) -> Path | None:
 SequenceArgument = Annotated[
     str,
     typer.Argument(
-        help="A folder (7-Scenes, TUM RGB-D, Replica, vMAP, ScanNet ..., recognised by itself), a recording of ROS "
-        "(.bag, .mcap, .db3) or a built-in room: synthetic/studio, synthetic/apartment, synthetic/corridor."
+        help="A folder (7-Scenes, TUM RGB-D, Replica, ScanNet ..., recognised by itself), a file (.bag, .mcap, .db3, "
+        ".sens, .r3d) or a built-in room: synthetic/studio, synthetic/apartment, synthetic/corridor."
     ),
 ]
 Preset = Annotated[str | None, typer.Option(help="lite, full, live, scannet or tum; default: what suits the layout.")]

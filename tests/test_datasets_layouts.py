@@ -14,6 +14,7 @@ import numpy as np
 import phone
 import pytest
 import robot
+import sens_writer
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -136,6 +137,26 @@ def write_stray(root: Path) -> Path:
     )
 
 
+def write_sens(root: Path) -> Path:
+    matrix = np.array([[2 * K[0, 0], 0, 2 * K[0, 2] + 0.5], [0, 2 * K[1, 1], 2 * K[1, 2] + 0.5], [0, 0, 1]])
+    colors, poses = [picture(i, 2 * W, 2 * H) for i in range(N)], [pose(i) for i in range(N)]
+    sens_writer.record(root / "a.sens", colors, [depth_values(1000)] * N, poses, K, color_matrix=matrix)
+    return root
+
+
+def write_record3d(root: Path) -> Path:
+    """Colour four times as fine as frames, depth half as fine."""
+    pytest.importorskip("lzfse")
+    import phone_video
+
+    matrix = np.array([[4 * K[0, 0], 0, 4 * K[0, 2] + 1.5], [0, 4 * K[1, 1], 4 * K[1, 2] + 1.5], [0, 0, 1]])
+    depth = depth_values(1000)[: H // 2, : W // 2] / np.float32(1000)
+    depth[0, :2] = 0, np.nan
+    poses = [pose(i) for i in range(N)]
+    colors = [picture(i, 4 * W, 4 * H) for i in range(N)]
+    return phone_video.write(root, phone_video.parts(colors, [depth] * N, poses, matrix))
+
+
 def write_neuralrgbd(root: Path) -> Path:
     poses = []
     for i in range(N):
@@ -167,8 +188,10 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "stray": write_stray,
     "neuralrgbd": write_neuralrgbd,
     "rosbag": write_rosbag,
+    "sens": write_sens,
+    "record3d": write_record3d,
 }
-PRESETS = {"tum": "tum", "scannet": "scannet"}
+PRESETS = {"tum": "tum", "scannet": "scannet", "sens": "scannet"}
 
 
 # ---- the contract ----
@@ -185,10 +208,8 @@ def folder(layout: str, tmp_path: Path) -> Path:
 
 
 def depth_files(folder: Path) -> list[Path]:
-    found = sorted(p for p in folder.rglob("*.png") if "depth" in str(p.relative_to(folder)))
-    if not found:
-        pytest.skip("its images are no files of their own")
-    return found
+    files = sorted(p for p in folder.rglob("*.png") if "depth" in str(p.relative_to(folder)))
+    return files or pytest.skip("its images are in one file")
 
 
 def test_exactly_one_layout_recognises_the_folder(folder: Path) -> None:
@@ -263,9 +284,8 @@ def test_a_bomb_among_the_images_changes_nothing_for_the_others(folder: Path) ->
     assert sequence[3].depth.shape == (H, W)
 
 
-def test_it_opens_without_ground_truth(layout: str, folder: Path) -> None:
-    if layout == "rosbag":
-        pytest.skip("its poses are no files of their own")
+def test_it_opens_without_ground_truth(folder: Path) -> None:
+    depth_files(folder)
     for path in [*folder.rglob("*.txt"), *folder.rglob("*.csv")]:
         if any(word in str(path.relative_to(folder)) for word in ("pose", "traj", "groundtruth", "odometry")):
             path.unlink()
@@ -324,7 +344,7 @@ def test_the_error_for_an_unknown_folder_lists_every_layout(tmp_path: Path) -> N
         open_sequence(tmp_path)
     assert all(
         name in str(caught.value)
-        for name in ("7-Scenes", "TUM", "NICE-SLAM", "vMAP", "ScanNet", "Stray", "Neural", "ROS")
+        for name in ("7-Scenes", "TUM", "NICE-SLAM", "vMAP", "ScanNet", ".sens", "Stray", "Neural", "ROS", "Record3D")
     )
 
 
@@ -411,6 +431,40 @@ def test_wrong_intrinsics_are_refused(tmp_path: Path, text: str, says: str) -> N
     (write_7scenes(tmp_path) / "camera-intrinsics.txt").write_text(text)
     with pytest.raises(InputError, match=says):
         open_sequence(tmp_path)
+
+
+INFO = """m_versionNumber = 4
+m_sensorName = StructureSensor
+m_colorWidth = 640
+m_colorHeight = 480
+m_depthWidth = 640
+m_depthHeight = 480
+m_depthShift = 1000
+m_calibrationColorIntrinsic = 583 0 321 0 0 583 241 0 0 0 1 0 0 0 0 1 
+m_calibrationDepthIntrinsic = 582.871 0 320 0 0 582.87 240 0 0 0 1 0 0 0 0 1 
+m_frames.size = 6
+"""
+
+
+@pytest.mark.parametrize("name", ["info.txt", "_info.txt"])
+def test_a_recording_of_bundlefusion_brings_its_camera(tmp_path: Path, name: str) -> None:
+    root = write_7scenes(tmp_path / "apt0")
+    (root / name).write_text(INFO)
+    assert open_sequence(root).intrinsics.fx == 60
+    (root / "camera-intrinsics.txt").unlink()
+    k = open_sequence(root).intrinsics
+    assert (k.fx, k.fy, k.cx, k.cy, k.width) == pytest.approx((58.2871, 58.287, 31.55, 23.55, 64))
+
+
+@pytest.mark.parametrize(("old", "new"), [("582.871", "?"), ("640", "0"), ("m_depthWidth", "width")])
+def test_a_camera_that_bundlefusion_does_not_tell_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    root = write_7scenes(tmp_path / "apt0")
+    (root / "camera-intrinsics.txt").unlink()
+    (root / "info.txt").write_text(INFO.replace(old, new))
+    with pytest.raises(InputError, match=r"info\.txt: tells no camera"):
+        open_sequence(root)
+    (root / "info.txt").write_text("a kitchen, on Monday\n")
+    assert open_sequence(root).intrinsics.fx == 58.5
 
 
 @pytest.mark.parametrize("text", ["inf " * 16, "-inf " * 16, "nan " * 16, "1 2", "", "hello", "2 " * 16])

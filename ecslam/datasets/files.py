@@ -84,8 +84,9 @@ class FileSequence:
     def _images(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour [H, W, 3] and depth [H, W] of a frame. Raises FrameError."""
         size = (self.intrinsics.width, self.intrinsics.height)
-        color: NDArray[Any] = read_color(self.color_files[index], self.color_size)
-        raw: NDArray[Any] = read_depth(self.depth_files[index], size)
+        color: NDArray[Any]
+        raw: NDArray[Any]
+        color, raw = self._stored(index, size)
         if self.color_size != size:
             color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
         color, raw = self._undistorted(color, raw)
@@ -98,6 +99,10 @@ class FileSequence:
         fixed, fraction, rounded = self._undistortion
         flat = cv2.remap(depth, rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
         return cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR), flat
+
+    def _stored(self, index: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """Colour at ``color_size`` and depth at ``size`` (width, height) as the files have them. Raises FrameError."""
+        return read_color(self.color_files[index], self.color_size), read_depth(self.depth_files[index], size)
 
     def _pose(self, index: int) -> NDArray[np.float64] | None:
         if self.poses is None or not np.isfinite(self.poses[index]).all():

@@ -1,6 +1,7 @@
 """From a path or an address to a sequence. Layouts are the modules of this folder that have ``sniff`` and ``open``.
 
 A new layout is one new file: its docstring's first line says, after the name and a colon, what the folder must hold.
+Where a single file can be a sequence, ``SUFFIXES`` are those of such files; ``sniff`` and ``open`` take its path, too.
 """
 
 from __future__ import annotations
@@ -19,11 +20,8 @@ SYNTHETIC = "synthetic/"
 
 
 class Layout(Protocol):
-    """A module of this folder that knows one way of laying a sequence out on disk.
-
-    Where a file can be a sequence, ``SUFFIXES`` are those of such files; ``OPTIONS``: what may follow a ``?`` after the
-    path, which ``open`` takes by these names.
-    """
+    """A module of this folder that knows one way of laying a sequence out on disk. ``OPTIONS``, if it has any: what may
+    follow a ``?`` after the path, which ``open`` takes by these names."""
 
     __name__: str
     __doc__: str | None
@@ -136,5 +134,5 @@ def looks_like_one(path: Path) -> bool:
 
 
 def _recognise(path: Path) -> Layout | None:
-    folder = path.is_dir()
-    return next((each for each in layouts() if (folder or path.suffix in suffixes_of(each)) and each.sniff(path)), None)
+    folder, suffix = path.is_dir(), path.suffix.lower()
+    return next((each for each in layouts() if (folder or suffix in suffixes_of(each)) and each.sniff(path)), None)

@@ -30,7 +30,6 @@ def open(path: Path) -> FileSequence:
     same_shape(color_size, size, root)
     pose_files = numbered(root / "pose", r"(\d{1,9})\.txt")
     poses, notes = read_pose_files([pose_files.get(n) for n in numbers])
-    meshes = (f / f"{scene.name}_vh_clean{end}.ply" for f in (root, scene) for end in ("", "_2"))
     return FileSequence(
         name=scene.name,
         layout="scannet",
@@ -42,9 +41,14 @@ def open(path: Path) -> FileSequence:
         times=np.array(numbers) / FRAMES_PER_S,
         poses=poses,
         color_size=color_size,
-        mesh_file=first_existing(*meshes),
+        mesh_file=find_mesh(scene.name, root, scene),
         notes=notes,
     )
+
+
+def find_mesh(scene: str, *folders: Path) -> Path | None:
+    """The reconstruction that comes with a scene, from the first of ``folders`` that holds it."""
+    return first_existing(*(f / f"{scene}_vh_clean{end}.ply" for f in folders for end in ("", "_2")))
 
 
 def _root(path: Path) -> Path | None:

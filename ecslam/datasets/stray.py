@@ -122,6 +122,14 @@ def turned(camera: Intrinsics, turns: int) -> Intrinsics:
     return camera
 
 
+def focus_note(focal: NDArray[np.float64]) -> Iterator[str]:
+    """What to say of focal lengths [M] that vary."""
+    if len(focal):
+        low, high = np.nanmin(focal), np.nanmax(focal)
+        if high - low > LENS_VARIES * high:
+            yield f"autofocus moves the focal length by {1 - low / high:.1%}; the median is used for all frames"
+
+
 def _lens(path: Path, size: tuple[int, int], odometry: Odometry | None) -> Intrinsics:
     """Of the video. The median over the frames, where they have one each: autofocus moves it a little."""
     if odometry is not None and odometry.lens is not None:
@@ -157,10 +165,8 @@ def _notes(path: Path, video: Video, depth: dict[int, Path], odometry: Odometry 
         without = len(depth.keys() - set(odometry.frames.tolist()))
         if without:
             yield f"{without} of {len(depth)} frames have no line in odometry.csv, and so no ground truth"
-        if odometry.lens is not None and len(odometry.lens):
-            low, high = np.nanmin(odometry.lens[:, 0]), np.nanmax(odometry.lens[:, 0])
-            if high - low > LENS_VARIES * high:
-                yield f"autofocus moves the focal length by {1 - low / high:.1%}; the median is used for all frames"
+        if odometry.lens is not None:
+            yield from focus_note(odometry.lens[:, 0])
     if turns:
         yield f"pictures are turned by {90 * turns} degrees to the right, for so the phone was held"
     late = sum(number >= len(video) for number in depth)

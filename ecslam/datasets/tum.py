@@ -1,32 +1,45 @@
-"""TUM RGB-D: rgb.txt and depth.txt, lists of time-stamped images (depth 5000 = 1 m), and groundtruth.txt."""
+"""TUM RGB-D: rgb.txt and depth.txt (or associations.txt), lists of time-stamped images (5000 = 1 m); groundtruth.txt.
+
+So are ETH3D's (with the camera in calibration.txt, about pixel centres, as its authors' BAD SLAM reads it), Bonn's and
+ICL-NUIM's.
+"""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..types import InputError, Intrinsics
+from .benchmarks import ICL_TRUTH, Benchmark, benchmark
 from .files import FileSequence
-from .reading import INTRINSICS_FILE, find_intrinsics, read_text, same_size
+from .meshes import first_existing
+from .reading import INTRINSICS_FILE, find_intrinsics, read_numbers, read_text, same_size
 
 MAX_DIFFERENCE_S = 0.02
 DEPTH_SCALE = 5000.0
-
-# Calibration of the colour cameras, from the data set's page on file formats and intrinsics.
-CAMERAS = {
-    "1": Intrinsics(517.3, 516.5, 318.6, 255.3, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "2": Intrinsics(520.9, 521.0, 325.1, 249.7, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "3": Intrinsics(535.4, 539.2, 320.1, 247.6, 640, 480),
-}
+MOST_MISSING = 0.05  # of the listed images; each of Bonn's recordings lacks some
+ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "associate.txt")
+CALIBRATION = "calibration.txt"
 UNKNOWN_CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
+
+Times = NDArray[np.float64]
+
+
+class Images(NamedTuple):
+    """times: [N] of the depth images."""
+
+    times: Times
+    color: list[Path]
+    depth: list[Path]
+    notes: tuple[str, ...]
 
 
 def sniff(path: Path) -> bool:
-    """Whether the folder has rgb.txt and depth.txt."""
-    return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+    """Whether the folder has rgb.txt and depth.txt, or one list of both."""
+    return _has_lists(path) or _associations(path) is not None
 
 
 def open(path: Path) -> FileSequence:
@@ -36,34 +49,24 @@ def open(path: Path) -> FileSequence:
     decides the pose: on freiburg1_xyz ground truth at the times of the depth images makes surfaces of different frames
     fit to 14 mm, at those of the colour images (12 ms later) to 21 mm.
     """
-    color_times, color_files = _read_list(path / "rgb.txt")
-    depth_times, depth_files = _read_list(path / "depth.txt")
-    pairs = associate(color_times, depth_times, MAX_DIFFERENCE_S)
-    if len(pairs) == 0:
-        raise InputError(
-            f"{path}: no colour and depth image lie within 20 ms of each other; do both lists count seconds, "
-            "on one clock?"
-        )
-    color_files, depth_files = [color_files[i] for i in pairs[:, 0]], [depth_files[i] for i in pairs[:, 1]]
-    _require(path, [*color_files, *depth_files])
-    size = same_size(color_files, depth_files)
-    camera, camera_notes = _camera(path, size)
-    times = depth_times[pairs[:, 1]]
-    poses, pose_notes = _ground_truth(path / "groundtruth.txt", times)
-    dropped = (len(color_times) - len(pairs), len(depth_times) - len(pairs))
-    notes = (f"{dropped[0]} colour and {dropped[1]} depth images have no partner within 20 ms and are left out",)
+    images = _from_lists(path) if _has_lists(path) else _from_associations(path)
+    size = same_size(images.color, images.depth)
+    known = benchmark(path, _header(path / "rgb.txt"))
+    camera, camera_notes = _camera(path, known, size)
+    times = _seconds(images.times, known)
+    poses, pose_notes = _ground_truth(path, known, times)
     return FileSequence(
         name=path.name,
-        layout="tum",
-        preset="tum",
+        layout=known.layout if known else "tum",
+        preset=known.preset if known else "tum",
         intrinsics=camera,
-        color_files=color_files,
-        depth_files=depth_files,
+        color_files=images.color,
+        depth_files=images.depth,
         depth_scale=DEPTH_SCALE,
         times=times,
         poses=poses,
         color_size=size,
-        notes=(*(notes if any(dropped) else ()), *camera_notes, *pose_notes),
+        notes=(*images.notes, *camera_notes, *pose_notes),
     )
 
 
@@ -141,47 +144,132 @@ def _numbers(rows: list[list[str]], path: Path) -> NDArray[np.float64]:
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     rows = _rows(path, 2)
     times = _numbers([row[:1] for row in rows], path)[:, 0]
-    if not np.isfinite(times).all():
-        raise InputError(f"{path}: a time is not finite; correct or remove that line")
+    _require_finite(times, path)
     return times, [path.parent / row[1] for row in rows]
 
 
-def _require(folder: Path, files: list[Path]) -> None:
-    missing = [file for file in files if not file.is_file()]
-    if missing:
+def _require_finite(times: Times, path: Path) -> None:
+    if not np.isfinite(times).all():
+        raise InputError(f"{path}: a time is not finite; correct or remove that line")
+
+
+def _has_lists(path: Path) -> bool:
+    return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+
+
+def _associations(path: Path) -> Path | None:
+    return first_existing(*(path / name for name in ASSOCIATIONS))
+
+
+def _from_lists(path: Path) -> Images:
+    """Of each list what is there, joined by time."""
+    color_times, color_files = _read_list(path / "rgb.txt")
+    depth_times, depth_files = _read_list(path / "depth.txt")
+    color, depth = _present(path, color_files), _present(path, depth_files)
+    pairs = associate(color_times[color], depth_times[depth], MAX_DIFFERENCE_S)
+    if len(pairs) == 0:
         raise InputError(
-            f"{folder}: {len(missing)} listed images are missing, the first is {missing[0]}; "
+            f"{path}: no colour and depth image lie within 20 ms of each other; do both lists count seconds, "
+            "on one clock?"
+        )
+    alone = len(color) - len(pairs), len(depth) - len(pairs)
+    notes = _notes_on_missing([*color_files, *depth_files], len(color) + len(depth))
+    if any(alone):
+        notes = (*notes, f"{alone[0]} colour and {alone[1]} depth images have no partner within 20 ms and are left out")
+    i, j = color[pairs[:, 0]], depth[pairs[:, 1]]
+    return Images(depth_times[j], [color_files[k] for k in i], [depth_files[k] for k in j], notes)
+
+
+def _from_associations(path: Path) -> Images:
+    """The pairs that somebody has made; whether depth comes first, as in ICL-NUIM, is told by the file names."""
+    file = _associations(path) or path / ASSOCIATIONS[0]
+    rows = _rows(file, 4)
+    depth_first = sum("depth" in row[1].lower() for row in rows) > sum("depth" in row[3].lower() for row in rows)
+    places = {"color": (2, 3), "depth": (0, 1)} if depth_first else {"color": (0, 1), "depth": (2, 3)}
+    times = _numbers([[row[places["depth"][0]]] for row in rows], file)[:, 0]
+    _require_finite(times, file)
+    color, depth = ([path / row[places[what][1]] for row in rows] for what in ("color", "depth"))
+    seen, measured = _present(path, color), _present(path, depth)
+    both = np.intersect1d(seen, measured)
+    notes = _notes_on_missing([*color, *depth], len(seen) + len(measured))
+    return Images(times[both], [color[k] for k in both], [depth[k] for k in both], notes)
+
+
+def _present(folder: Path, files: list[Path]) -> NDArray[np.int64]:
+    """The indices of those that exist. Raises InputError when too many do not."""
+    there = np.array([file.is_file() for file in files])
+    if (~there).sum() > MOST_MISSING * len(files):
+        raise InputError(
+            f"{folder}: {(~there).sum()} listed images are missing, the first is {files[there.argmin()]}; "
             "copy them there or take their lines out"
         )
+    return np.flatnonzero(there)
 
 
-def _camera(path: Path, size: tuple[int, int]) -> tuple[Intrinsics, tuple[str, ...]]:
-    """Which of the three cameras it was, told by the folder's name or the header of rgb.txt."""
-    header = "".join(line for line in read_text(path / "rgb.txt").splitlines()[:10] if line.startswith("#"))
-    matches = (re.search(r"(?<![a-z])(?:fr|freiburg)[_-]?([123])(?!\d)", text.lower()) for text in (path.name, header))
-    known = next((CAMERAS[match[1]] for match in matches if match), None)
-    camera, notes = find_intrinsics([path], known or UNKNOWN_CAMERA, size)
-    if known is None and not (path / INTRINSICS_FILE).is_file():
+def _notes_on_missing(files: list[Path], there: int) -> tuple[str, ...]:
+    if there == len(files):
+        return ()
+    first = next(file for file in files if not file.is_file())
+    return (f"{len(files) - there} listed images are missing and are left out, the first is {first.name}",)
+
+
+def _header(file: Path) -> str:
+    """The comments at its beginning."""
+    if not file.is_file():
+        return ""
+    return "".join(line for line in read_text(file).splitlines()[:10] if line.startswith("#"))
+
+
+def _camera(path: Path, known: Benchmark | None, size: tuple[int, int]) -> tuple[Intrinsics, tuple[str, ...]]:
+    """From a file, or known by the folder's name or the header of rgb.txt. Known ones have their distortion."""
+    by_hand, calibrated = ((path / name).is_file() for name in (INTRINSICS_FILE, CALIBRATION))
+    if calibrated and not by_hand and known is None:
+        values = read_numbers(path / CALIBRATION)
+        if values.size != 4 or not np.isfinite(values).all():
+            raise InputError(
+                f"{path / CALIBRATION}: {values.size} numbers, but it takes four, fx fy cx cy; write these, or the "
+                f"camera's 3x3 matrix to {INTRINSICS_FILE} there"
+            )
+        fx, fy, cx, cy = values.tolist()
+        return Intrinsics(fx, fy, cx, cy, *size), ()
+    camera, notes = find_intrinsics([path], known.camera if known else UNKNOWN_CAMERA, size)
+    if known is None and not by_hand:
         notes = (
             *notes,
-            f"a standard Kinect is assumed: no {INTRINSICS_FILE}, and no freiburg1, 2 or 3 in the folder's name",
+            f"a standard Kinect is assumed: no {INTRINSICS_FILE} or {CALIBRATION}, and no recording that is known by "
+            "its folder's name (freiburg1, 2 or 3 ...)",
         )
+    if calibrated and (known or by_hand):
+        notes = (*notes, f"{CALIBRATION} is not used: {INTRINSICS_FILE if by_hand else 'the camera is known'}")
     return camera, notes
 
 
-def _ground_truth(path: Path, times: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    if not path.is_file():
+def _seconds(times: Times, known: Benchmark | None) -> Times:
+    """Times, or frame numbers where the benchmark has these."""
+    numbered = known is not None and known.frames_per_s > 0 and (times == np.rint(times)).all()
+    return times / known.frames_per_s if known is not None and numbered else times
+
+
+def _ground_truth(
+    path: Path, known: Benchmark | None, times: Times
+) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    files = [each for each in (path / "groundtruth.txt", *sorted(path.glob(ICL_TRUTH))) if each.is_file()]
+    if not files:
         return None, ()
-    rows = _numbers(_rows(path, 8), path)
+    if len(files) > 1:
+        names = ", ".join(each.name for each in files)
+        return None, (f"several files of ground truth ({names}), so none is used; leave one",)
+    (file,) = files
+    rows = _numbers(_rows(file, 8), file)
     usable = rows[np.isfinite(rows).all(1) & (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.1)]
     if len(usable) == 0:
         raise InputError(
-            f"{path}: no line is a pose (time x y z qx qy qz qw with a unit quaternion); correct or remove it"
+            f"{file}: no line is a pose (time x y z qx qy qz qw with a unit quaternion); correct or remove it"
         )
-    known, first = np.unique(usable[:, 0], return_index=True)
-    poses = interpolate_poses(known, usable[first, 1:], times, MAX_DIFFERENCE_S)
+    stamps, first = np.unique(_seconds(usable[:, 0], known), return_index=True)
+    poses = interpolate_poses(stamps, usable[first, 1:], times, MAX_DIFFERENCE_S)
     missing = int(np.isnan(poses[:, 0, 0]).sum())
     notes = (f"{missing} of {len(times)} frames have no ground truth within 20 ms",) if missing else ()
     if len(usable) < len(rows):
-        notes = (*notes, f"{len(rows) - len(usable)} lines of {path.name} are not poses and are left out")
-    return poses, notes
+        notes = (*notes, f"{len(rows) - len(usable)} lines of {file.name} are not poses and are left out")
+    return (known.before @ poses @ known.after if known else poses), notes
