@@ -26,8 +26,8 @@ FILM_STEPS, FILM_SIZE, STEP_MS, END_MS = 36, (960, 573), 160, 2500
 
 
 def take(runs: list[Path], out: Path) -> list[Path]:
-    """Write the pictures light, dark, phone, loops and (with two runs) compare, and the film of the first run, into
-    ``out``. Raises InputError."""
+    """Write the pictures dark, phone, loops and (with two runs) compare, and the film of the first run, into ``out``.
+    Raises InputError."""
     out.mkdir(parents=True, exist_ok=True)
     made = []
     with launch() as browser:
@@ -46,7 +46,6 @@ def _pictures(
 ) -> list[tuple[str, tuple[int, int], bool, list[Path], Callable[[Any, Dashboard], None]]]:
     first = runs[:1]
     pictures = [
-        ("light", DESKTOP, False, first, _show_plots),
         ("dark", DESKTOP, True, first, _show_plots),
         ("phone", PHONE, False, first, _show_nothing),
         ("loops", DESKTOP, False, first, _show_loop),

@@ -193,7 +193,7 @@ def synth(
 
 @app.command()
 def check(sequence: SequenceArgument) -> None:
-    """Say what a folder is and what looks odd about it, before a run."""
+    """Say what a recording is and what looks odd about it, before a run."""
     from .datasets import open_sequence
     from .datasets.check import check_sequence, format_report
 
