@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import ctypes
-import resource
+import mmap
 import sys
 from pathlib import Path
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
 LARGE = 2 << 20
 
 
 def peak_memory_mb() -> float:
-    """The most memory this process has had so far, in 10^6 bytes."""
+    """The most memory this process has had so far, in 10^6 bytes; NaN where the system does not tell."""
+    if resource is None:
+        return float("nan")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
@@ -20,7 +27,7 @@ def peak_memory_mb() -> float:
 def resident_mb() -> float:
     """Memory of this process now, in 10^6 bytes; the most it has had where the system does not tell."""
     try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 1e6
     except (OSError, IndexError, ValueError):
         return peak_memory_mb()
 

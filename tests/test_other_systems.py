@@ -1,0 +1,24 @@
+"""What other operating systems lack, and where a disk, a locale or a processor differs from the usual."""
+
+import subprocess
+import sys
+
+import pytest
+
+WITHOUT_POSIX = """
+import sys
+sys.modules |= {"fcntl": None, "resource": None}  # as on Windows
+from pathlib import Path
+from ecslam import commands
+from ecslam.runtime.engine import Engine
+from ecslam.runtime.summary import peak_memory_mb
+engine = Engine(commands.config_files.load_preset("live"), "synthetic/studio?size=64x48&frames=2", Path(sys.argv[1]))
+assert engine.run()["frames"] == 2
+assert peak_memory_mb() != peak_memory_mb()
+"""
+
+
+@pytest.mark.slow
+def test_an_engine_runs_without_the_modules_of_unix(tmp_path):
+    subprocess.run([sys.executable, "-c", WITHOUT_POSIX, str(tmp_path / "run")], check=True)
+    assert '"peak_memory_mb":null' in (tmp_path / "run" / "summary.json").read_text()
