@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 
 from ecslam.types import InputError
@@ -20,7 +21,8 @@ def bind(host: str, port: int) -> socket.socket:
             f"--host {host}: no such host; 127.0.0.1 serves this machine, 0.0.0.0 all its networks"
         ) from None
     listener = socket.socket(family, kind)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if os.name == "posix":  # elsewhere it would share a port that is busy
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind(address)
         listener.listen(128)

@@ -1,9 +1,12 @@
 """What other operating systems lack, and where a disk, a locale or a processor differs from the usual."""
 
+import os
+import socket
 import subprocess
 import sys
 
 import pytest
+from ecslam_app.listen import bind
 
 WITHOUT_POSIX = """
 import sys
@@ -22,3 +25,12 @@ assert peak_memory_mb() != peak_memory_mb()
 def test_an_engine_runs_without_the_modules_of_unix(tmp_path):
     subprocess.run([sys.executable, "-c", WITHOUT_POSIX, str(tmp_path / "run")], check=True)
     assert '"peak_memory_mb":null' in (tmp_path / "run" / "summary.json").read_text()
+
+
+@pytest.mark.parametrize("system", ["posix", "nt"])
+def test_a_port_is_reused_at_once_only_where_that_shares_none_that_is_busy(monkeypatch, system):
+    monkeypatch.setattr(os, "name", system)
+    listener = bind("127.0.0.1", 0)
+    monkeypatch.undo()
+    with listener:
+        assert bool(listener.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR)) == (system == "posix")
