@@ -33,14 +33,16 @@ format: $(VENV)/.ready-dev
 
 setup: $(VENV)/.ready
 
-$(VENV)/bin/python:
+# pip, not python: where the system lacks a part of venv, that leaves a python without one.
+$(BIN)/pip:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || (echo "Python 3.10 or newer is needed; name it with: make PYTHON=python3.11 ..." && exit 1)
 	$(PYTHON) -m venv $(VENV)
 
 # torch first, so that a CPU build which satisfies the pins is kept.
-$(VENV)/.ready: pyproject.toml | $(VENV)/bin/python
+$(VENV)/.ready: pyproject.toml | $(BIN)/pip
 	@echo "Setting up $(VENV) (a few minutes the first time) ..."
-	$(PIP) "torch>=2.10,<2.14"
+	$(PIP) "torch>=2.10,<2.14" \
+		|| (echo "torch could not be installed. If there is none for this Python, name another: make clean, then make PYTHON=python3.13 ..." && exit 1)
 	$(PIP) -e .
 	@echo "Compiling the kernels for this machine ..."
 	@$(BIN)/ecslam run "synthetic/studio?size=80x60&frames=8" --preset live --headless --out $(VENV)/first-run >$(VENV)/first-run.log \
