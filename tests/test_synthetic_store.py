@@ -91,3 +91,12 @@ def test_a_failed_write_leaves_nothing_behind(folder: Path, monkeypatch: pytest.
     monkeypatch.setattr(np, "savez", full)
     assert same(store.kept("hut", Baker()))
     assert list(folder.iterdir()) == []
+
+
+def test_who_has_no_home_gets_a_room_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody(path: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "expanduser", nobody)
+    assert same(store.kept("hut", Baker()))
