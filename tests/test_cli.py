@@ -121,6 +121,17 @@ def test_check_says_what_looks_odd(sequence, tmp_path):
     assert "depth000002.png" in report.out
 
 
+def test_a_name_that_the_output_cannot_encode_is_spelt_out(sequence, tmp_path):
+    room = shutil.copytree(sequence, tmp_path / "кухня")
+    out = io.TextIOWrapper(io.BytesIO(), "latin-1")
+    arguments = mock.patch.object(sys, "argv", ["ecslam", "check", str(room)])
+    with arguments, contextlib.redirect_stdout(out), pytest.raises(SystemExit) as end:
+        cli.main()
+    assert not end.value.code
+    out.flush()
+    assert b"\\u043a\\u0443" in out.buffer.getvalue()
+
+
 def test_check_judges_depth_by_what_a_run_with_this_layout_uses(tmp_path):
     for n in range(2):
         cv2.imwrite(str(tmp_path / f"frame-{n:06d}.color.png"), np.full((48, 64, 3), 99, np.uint8))
