@@ -474,6 +474,11 @@ def test_a_camera_that_bundlefusion_does_not_tell_is_refused(tmp_path: Path, old
     assert open_sequence(root).intrinsics.fx == 58.5
 
 
+def test_a_matrix_saved_by_windows_is_read(tmp_path: Path) -> None:
+    (write_7scenes(tmp_path) / "camera-intrinsics.txt").write_bytes(b"\xef\xbb\xbf60 0 32\r\n0 61 24\r\n0 0 1\r\n")
+    assert open_sequence(tmp_path).intrinsics.fy == 61
+
+
 @pytest.mark.parametrize("text", ["inf " * 16, "-inf " * 16, "nan " * 16, "1 2", "", "hello", "2 " * 16])
 def test_a_bad_pose_is_no_pose_and_is_counted(tmp_path: Path, text: str) -> None:
     (write_scannet(tmp_path) / "pose/2.txt").write_text(text)

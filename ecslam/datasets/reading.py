@@ -50,11 +50,11 @@ def paired(color: dict[int, Path], depth: dict[int, Path], folder: Path) -> list
 
 
 def read_text(path: Path) -> str:
-    """A text file of sensible size. Raises InputError."""
+    """A text file of sensible size, without the mark that Windows puts before UTF-8. Raises InputError."""
     try:
         if path.stat().st_size > MAX_TEXT_BYTES:
             raise InputError(f"{path}: over {MAX_TEXT_BYTES >> 20} MiB of text; is it the right file?")
-        return path.read_text("utf-8")
+        return path.read_text("utf-8-sig")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
