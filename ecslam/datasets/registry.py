@@ -85,10 +85,12 @@ def _resolve(address: str) -> Path:
 
 
 def _open_path(path: Path, options: dict[str, str]) -> Sequence:
-    if not path.exists():
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
         raise InputError(
             f"{path}: no such folder or file; give the folder of a sequence, or {SYNTHETIC}studio for a built-in room"
-        )
+        ) from None
     layout = _recognise(path)
     if layout is None:
         raise InputError(_why_unknown(path))
