@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 
+from ..cores import cores
 from ..types import Frame, FrameError, Sequence
 
 MOST_WORKERS = 12
@@ -15,7 +15,7 @@ MOST_WORKERS = 12
 
 def workers() -> int:
     """How many threads read frames: one a core, within reason."""
-    return min(max(os.cpu_count() or 1, 2), MOST_WORKERS)
+    return min(max(cores(), 2), MOST_WORKERS)
 
 
 class Prefetch(Iterator[tuple[int, Frame | FrameError]]):

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cores import cores
 from ..types import FrameError
 from .mp4 import read_track
 
@@ -97,7 +98,7 @@ class Video:
         self._rewind()
 
     def _rewind(self) -> cv2.VideoCapture:
-        threads = min(os.cpu_count() or 1, MOST_THREADS)
+        threads = min(cores(), MOST_THREADS)
         self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # its default depends on the version
         self._at = -1

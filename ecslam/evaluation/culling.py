@@ -10,20 +10,20 @@ triangles would be kept or dropped as a whole.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cores import cores
 from ..indices import evenly
 from ..kernels.raster import in_sight, rasterize
 from ..types import Intrinsics, Mesh
 from .surface import part
 
 OCCLUSION_MARGIN_M = 0.03
-WORKERS = os.cpu_count() or 1
+WORKERS = cores()
 
 DepthFunction = Callable[[int], NDArray[np.float32]]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from ._cpu_math import BOTH, HALF, INNER, dots, sigmoid
-from ._cpu_simd import floor, fma, highest, isplat, load, lowest, splat, store, to_int
+from ._cpu_simd import exact_fma, floor, fma, highest, isplat, load, lowest, splat, store, to_int
 from ._cpu_table import gather
 from ._cpu_tile import make_tile
 
@@ -179,7 +179,7 @@ def split(x, rest, inverse, lost):
     """Cell coordinate and fraction of a position x + rest with inverse voxel size inverse + lost, as if in float64: the
     derivative of the field jumps where the cell changes."""
     cell = floor(x * inverse)
-    fraction = fma(x, inverse, splat(np.float32(0)) - cell) + fma(rest, inverse, x * lost)
+    fraction = exact_fma(x, inverse, splat(np.float32(0)) - cell) + fma(rest, inverse, x * lost)
     over = floor(fraction)
     return cell + over, fraction - over
 

@@ -136,6 +136,12 @@ def fma(typing, a, b, c):
 
 
 @intrinsic
+def exact_fma(typing, a, b, c):
+    """a * b + c, rounded once on every machine; slow on those without such an instruction."""
+    return f32x8(a, b, c), lambda context, builder, signature, args: emit_call(builder, "llvm.fma", *args)
+
+
+@intrinsic
 def floor(typing, a):
     """Largest whole number not above each lane."""
     return f32x8(a), lambda context, builder, signature, args: emit_call(builder, "llvm.floor", *args)
