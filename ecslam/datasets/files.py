@@ -85,12 +85,12 @@ class FileSequence:
         """Colour [H, W, 3] and depth [H, W] of a frame. Raises FrameError."""
         size = (self.intrinsics.width, self.intrinsics.height)
         color: NDArray[Any]
-        raw: NDArray[Any]
-        color, raw = self._stored(index, size)
+        depth: NDArray[Any]
+        color, depth = self._stored(index, size)
         if self.color_size != size:
             color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-        color, raw = self._undistorted(color, raw)
-        return color, fill_pinholes(to_metres(raw, self.depth_scale))
+        color, depth = self._undistorted(color, depth)
+        return color, fill_pinholes(depth)
 
     def _undistorted(self, color: NDArray[Any], depth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Both images without what the lens does to them."""
@@ -100,9 +100,10 @@ class FileSequence:
         flat = cv2.remap(depth, rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
         return cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR), flat
 
-    def _stored(self, index: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-        """Colour at ``color_size`` and depth at ``size`` (width, height) as the files have them. Raises FrameError."""
-        return read_color(self.color_files[index], self.color_size), read_depth(self.depth_files[index], size)
+    def _stored(self, index: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Colour at ``color_size`` and metres at ``size`` (width, height), as the lens drew them. Raises FrameError."""
+        color = read_color(self.color_files[index], self.color_size)
+        return color, to_metres(read_depth(self.depth_files[index], size), self.depth_scale)
 
     def _pose(self, index: int) -> NDArray[np.float64] | None:
         if self.poses is None or not np.isfinite(self.poses[index]).all():

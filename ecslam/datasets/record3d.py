@@ -25,7 +25,7 @@ from ..types import FrameError, InputError, Intrinsics
 from .files import FileSequence
 from .images import HEADER_BYTES, decode_color, parse_header, read_bytes
 from .reading import MAX_PIXELS, MAX_TEXT_BYTES, OPENGL, finite_poses, rigid, same_shape
-from .stray import FINER, LEAST_CONFIDENCE, finer, focus_note
+from .stray import ARKIT_TRUTH, FINER, LEAST_CONFIDENCE, finer, focus_note
 
 SUFFIXES = (".r3d",)
 FRAMES, DEPTH = "rgbd", r"rgbd/(\d{1,9})\.depth"
@@ -225,7 +225,7 @@ def _notes(about: Metadata, alone: int, without: int, unmoved: bool, confident: 
     if unmoved:
         yield "each of its poses is the identity, as from the face camera, which is taken for none"
     elif len(about.poses):
-        yield "the ground truth is ARKit's estimate: a difference from it need not be an error"
+        yield ARKIT_TRUTH
         if without:
             yield f"{without} frames have no ground truth"
     if about.lens is not None:

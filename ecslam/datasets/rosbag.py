@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..types import InputError
 from .files import FileSequence
-from .images import fill_pinholes
 from .reading import same_shape
 from .rosfiles import Place
 from .rosimages import color_of, depth_of
@@ -48,16 +46,11 @@ class RosRecording(FileSequence):
     def _place(self) -> Path:
         return self.recording.path
 
-    def _images(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        size = self.intrinsics.width, self.intrinsics.height
+    def _stored(self, index: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         message = self.recording.message(self.color.name, self.color_places[index])
         color = color_of(message, self.color_size, f"{self.recording.path}: {self.color.name} of frame {index}")
         message = self.recording.message(self.depth.name, self.depth_places[index])
-        depth = depth_of(message, size, f"{self.recording.path}: {self.depth.name} of frame {index}")
-        if self.color_size != size:
-            color = cv2.resize(color, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-        color, depth = self._undistorted(color, depth)
-        return color, fill_pinholes(depth)
+        return color, depth_of(message, size, f"{self.recording.path}: {self.depth.name} of frame {index}")
 
 
 def open(path: Path, color: str = "", depth: str = "") -> RosRecording:

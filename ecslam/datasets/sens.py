@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..types import FrameError, InputError, Intrinsics
 from .files import FileSequence
-from .images import decode_color
+from .images import decode_color, to_metres
 from .reading import MAX_PIXELS, finite_poses, rigid, same_shape
 from .scannet import find_mesh
 
@@ -78,7 +78,7 @@ class SensorStream(FileSequence):
     def _place(self) -> Path:
         return self.file
 
-    def _stored(self, index: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+    def _stored(self, index: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         place = f"{self.file}: frame {index}"
         lengths = int(self.frames["color_bytes"][index]), int(self.frames["depth_bytes"][index])
         if sum(lengths) > MOST_IMAGE_BYTES:
@@ -90,7 +90,7 @@ class SensorStream(FileSequence):
         except OSError as error:
             raise FrameError(f"{place}: cannot be read ({error.strerror})") from None
         color = decode_color(f"{place}, colour", data[: lengths[0]], self.color_size)
-        return color, _inflate(f"{place}, depth", data[lengths[0] :], size)
+        return color, to_metres(_inflate(f"{place}, depth", data[lengths[0] :], size), self.depth_scale)
 
 
 def open(path: Path) -> SensorStream:

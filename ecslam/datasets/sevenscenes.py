@@ -29,7 +29,7 @@ FRAMES_PER_S = 30.0
 
 def sniff(path: Path) -> bool:
     """Whether the folder, or a seq-NN folder in it, holds frame-NNNNNN.color images."""
-    return has_numbered(path, COLOR) or (path.is_dir() and bool(_parts(path)))
+    return has_numbered(path, COLOR) or bool(_parts(path))
 
 
 def open(path: Path) -> FileSequence:

@@ -29,6 +29,7 @@ SAME_SURFACE = 0.05  # of the distance
 LEAST_CONFIDENCE = 1  # of 0, 1 and 2; the app's own viewer has the same
 LEVEL = 0.3  # least part of gravity in the picture's plane that tells which way it was held
 LENS_VARIES = 0.02
+ARKIT_TRUTH = "the ground truth is ARKit's estimate: a difference from it need not be an error"
 TURN = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # to the camera of a picture turned right
 
 
@@ -160,7 +161,7 @@ def _times(odometry: Odometry | None, numbers: list[int], video: Video) -> NDArr
 
 def _notes(path: Path, video: Video, depth: dict[int, Path], odometry: Odometry | None, turns: int) -> Iterator[str]:
     if odometry is not None:
-        yield "the ground truth is ARKit's estimate: a difference from it need not be an error"
+        yield ARKIT_TRUTH
         yield from odometry.notes
         without = len(depth.keys() - set(odometry.frames.tolist()))
         if without:
