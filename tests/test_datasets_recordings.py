@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from ecslam.datasets import Prefetch, open_sequence
 from ecslam.datasets.check import check_sequence
+from ecslam.datasets.files import FileSequence
 from ecslam.types import Frame
 
 RECORDINGS = Path(os.environ.get("ECSLAM_RECORDINGS", Path(__file__).parents[2] / "shared/data"))
@@ -49,6 +51,33 @@ def test_depth_poses_and_intrinsics_agree_with_each_other(name: str, layout: str
     camera = sequence.intrinsics.matrix()
     misfits = [misfit_m(cloud(sequence[i], camera), sequence[i + 25], camera) for i in range(0, 140, 20)]
     assert np.mean(misfits) < 0.02
+
+
+def colour_misfit(a: Frame, b: Frame, camera: np.ndarray) -> float:
+    """Mean difference of brightness at points that two frames measured."""
+    assert a.c2w_gt is not None
+    assert b.c2w_gt is not None
+    v, u = np.mgrid[24:456:2, 24:616:2]
+    z = a.depth[v, u]
+    points = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera).T * z[..., None]
+    a_to_b = np.linalg.inv(b.c2w_gt) @ a.c2w_gt
+    local = points @ a_to_b[:3, :3].T + a_to_b[:3, 3]
+    with np.errstate(all="ignore"):
+        x, y = np.rint(np.nan_to_num((local @ camera.T)[..., :2] / local[..., 2:])).astype(int).transpose(2, 0, 1)
+    both = (z > 0) & (x >= 0) & (x < 640) & (y >= 0) & (y < 480)
+    x, y = x[both], y[both]
+    same = np.abs(b.depth[y, x] - local[both][:, 2]) < 0.03
+    return float(np.abs(a.color.mean(2)[v, u][both][same] - b.color.mean(2)[y, x][same]).mean())
+
+
+def test_colour_of_7scenes_lies_where_depth_is() -> None:
+    """Two frames must see a point in the same colour; as stored they see what is beside it."""
+    sequence = open_sequence(recording("7scenes-redkitchen"))
+    assert isinstance(sequence, FileSequence)
+    camera, as_stored = sequence.intrinsics.matrix(), dataclasses.replace(sequence, registration=None)
+    pairs = [(i, i + 8) for i in range(0, 160, 40)]
+    moved, stored = (np.mean([colour_misfit(s[a], s[b], camera) for a, b in pairs]) for s in (sequence, as_stored))
+    assert moved < 0.75 * stored
 
 
 @pytest.mark.parametrize(("name", "frames"), [("7scenes-redkitchen", 400), ("tum-fr1-xyz", 174)])

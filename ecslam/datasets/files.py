@@ -6,15 +6,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Frame, InputError, Intrinsics, Mesh
-from .images import fill_pinholes, read_color, read_depth, to_metres
+from .images import fill_pinholes, read_color, read_depth, shrunk, to_metres
+from .lens import Lens
 from .meshes import load_mesh
+from .registration import Registration
 
 
 @dataclass(eq=False)
@@ -22,7 +23,8 @@ class FileSequence:
     """The ``Sequence`` that every layout on disk opens to; nothing writes to it afterwards.
 
     intrinsics: of the depth images; their distortion is removed from both images on reading. color_size: (width,
-    height) of the colour files, which are resized where it differs. depth_scale: stored units per metre. times: [N]
+    height) of the colour files, which are resized where it differs. registration: where colour is to be moved to depth;
+    intrinsics are then its ``camera``. depth_scale: stored units per metre. times: [N]
     seconds. poses: [N, 4, 4] camera-to-world, NaN where a frame has none, or None. notes: what opening it brought to
     light, one sentence each. Raises InputError when these do not belong together.
     """
@@ -40,6 +42,7 @@ class FileSequence:
     mesh_file: Path | None = None
     notes: tuple[str, ...] = ()
     bounds: NDArray[np.float64] | None = None
+    registration: Registration | None = None
 
     def __post_init__(self) -> None:
         k = self.intrinsics
@@ -83,25 +86,17 @@ class FileSequence:
 
     def _images(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour [H, W, 3] and depth [H, W] of a frame. Raises FrameError."""
+        if self.registration is not None:
+            stored = self.registration.depth
+            return self.registration.registered(*self._stored(index, (stored.width, stored.height)))
         size = (self.intrinsics.width, self.intrinsics.height)
-        color: NDArray[Any]
-        depth: NDArray[Any]
         color, depth = self._stored(index, size)
         if self.color_size != size:
-            color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-        color, depth = self._undistorted(color, depth)
-        return color, fill_pinholes(depth)
-
-    def _undistorted(self, color: NDArray[Any], depth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Both images without what the lens does to them."""
-        if not self.intrinsics.distortion:
-            return color, depth
-        fixed, fraction, rounded = self._undistortion
-        flat = cv2.remap(depth, rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-        return cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR), flat
+            color = shrunk(color, size)
+        return self._lens.straight_color(color), fill_pinholes(self._lens.straight_depth(depth))
 
     def _stored(self, index: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Colour at ``color_size`` and metres at ``size`` (width, height), as the lens drew them. Raises FrameError."""
+        """Colour at ``color_size`` and metres at ``size`` (width, height), as lenses drew them. Raises FrameError."""
         color = read_color(self.color_files[index], self.color_size)
         return color, to_metres(read_depth(self.depth_files[index], size), self.depth_scale)
 
@@ -111,10 +106,5 @@ class FileSequence:
         return cast("NDArray[np.float64]", self.poses[index])
 
     @cached_property
-    def _undistortion(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Look-up maps in OpenCV's fast fixed-point form: two for linear colour, one, rounded, for nearest depth."""
-        k, size = self.intrinsics.matrix(), (self.intrinsics.width, self.intrinsics.height)
-        x, y = cv2.initUndistortRectifyMap(k, np.array(self.intrinsics.distortion), None, k, size, cv2.CV_32FC1)
-        fixed, fraction = cv2.convertMaps(x, y, cv2.CV_16SC2)
-        rounded, _ = cv2.convertMaps(x, y, cv2.CV_16SC2, nninterpolation=True)
-        return fixed, fraction, rounded
+    def _lens(self) -> Lens:
+        return Lens(self.intrinsics)

@@ -96,6 +96,11 @@ def to_metres(raw: NDArray[np.uint16], scale: float) -> NDArray[np.float32]:
     return metres
 
 
+def shrunk(color: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """A picture [H, W, 3] at ``size`` (width, height): a pixel of it is the mean of those that it covers."""
+    return np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def fill_pinholes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     """The same depth [H, W], 0 = none. Where it is speckled with single missing pixels, as after registration to a
     finer colour image without interpolation, those get what lies around them, except across depth edges: a surface seen

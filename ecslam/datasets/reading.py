@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from ..indices import evenly
 from ..types import FrameError, InputError, Intrinsics
 from .images import read_header
+from .registration import Registration
 
 MAX_PIXELS = 64_000_000
 MAX_TEXT_BYTES = 64 << 20
 INTRINSICS_FILE = "camera-intrinsics.txt"
+COLOR_INTRINSICS_FILE, DEPTH_TO_COLOR_FILE = "color-intrinsics.txt", "depth-to-color.txt"
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from its camera axes to OpenCV's, or back
 
 
@@ -126,6 +128,27 @@ def same_size(color_files: list[Path], depth_files: list[Path]) -> tuple[int, in
             "this layout has both at one size, pixel on pixel: export them again, registered"
         )
     return depth
+
+
+def find_registration(folder: Path, depth: Intrinsics, color_size: tuple[int, int]) -> Registration | None:
+    """What ``color-intrinsics.txt`` (3x3) and ``depth-to-color.txt`` (4x4, metres) in ``folder`` say of another camera
+    than ``depth`` for colour images of ``color_size`` (width, height); None without them. Raises InputError."""
+    matrix, motion = folder / COLOR_INTRINSICS_FILE, folder / DEPTH_TO_COLOR_FILE
+    if matrix.is_file() != motion.is_file():
+        missing, present = (motion, matrix) if matrix.is_file() else (matrix, motion)
+        raise InputError(f"{missing}: is missing, but {present.name} is there; colour is registered by both together")
+    if not matrix.is_file():
+        return None
+    values = read_numbers(motion)
+    moves = rigid(values.reshape(-1, 4, 4))[0] if values.size == 16 else np.full((1, 4, 4), np.nan)
+    if not np.isfinite(moves).all():
+        raise InputError(
+            f"{motion}: not a rigid motion as a 4x4 matrix, from depth's camera to that of colour, in metres"
+        )
+    try:
+        return Registration(depth, read_intrinsics(matrix, *color_size), moves[0])
+    except InputError as error:
+        raise InputError(f"{motion}: {error}") from None
 
 
 def same_shape(color: tuple[int, int], depth: tuple[int, int], folder: Path) -> None:

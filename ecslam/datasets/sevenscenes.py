@@ -1,4 +1,7 @@
-"""7-Scenes: frame-000000.color.png (or .jpg), .depth.png (millimetres) and .pose.txt, here or in seq-01."""
+"""7-Scenes: frame-000000.color.png (or .jpg), .depth.png (millimetres) and .pose.txt, here or in seq-01.
+
+Colour comes as the Kinect took it, beside depth and through a wider lens; left there, it is up to 40 pixels off.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,9 @@ from .files import FileSequence
 from .meshes import first_existing
 from .reading import (
     INTRINSICS_FILE,
+    common_size,
     find_intrinsics,
+    find_registration,
     has_numbered,
     numbered,
     paired,
@@ -20,9 +25,11 @@ from .reading import (
     read_text,
     same_size,
 )
+from .registration import Registration
 
 COLOR = r"frame-(\d{1,9})\.color\.(?:jpg|png)"
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, 640, 480)
+KINECT_COLOR, KINECT_BASELINE_M = Intrinsics(525.0, 525.0, 320.0, 240.0, 640, 480), 0.025  # redkitchen fits these best
 INFO, INFO_KEY = ("info.txt", "_info.txt"), "m_calibrationDepthIntrinsic"
 FRAMES_PER_S = 30.0
 
@@ -43,8 +50,12 @@ def open(path: Path) -> FileSequence:
     color = numbered(folder, COLOR)
     depth = numbered(folder, r"frame-(\d{1,9})\.depth\.png")
     numbers = paired(color, depth, folder)
-    size = same_size(list(color.values()), list(depth.values()))
-    camera, notes = _camera(folder, size)
+    colors, depths = list(color.values()), list(depth.values())
+    color_size = common_size(colors)
+    camera, notes = _camera(folder, common_size(depths))
+    registration = find_registration(folder, camera, color_size) or _kinect(camera, color_size)
+    if registration is None:
+        same_size(colors, depths)
     pose_files = numbered(folder, r"frame-(\d{1,9})\.pose\.txt")
     poses, pose_notes = read_pose_files([pose_files.get(n) for n in numbers])
     name = folder.name if not folder.name.startswith("seq-") else f"{folder.parent.name}-{folder.name}"
@@ -52,15 +63,25 @@ def open(path: Path) -> FileSequence:
         name=name,
         layout="7scenes",
         preset="lite",
-        intrinsics=camera,
-        color_files=list(color.values()),
-        depth_files=list(depth.values()),
+        intrinsics=registration.camera if registration else camera,
+        color_files=colors,
+        depth_files=depths,
         depth_scale=1000.0,
         times=np.array(numbers) / FRAMES_PER_S,
         poses=poses,
-        color_size=size,
+        color_size=color_size,
         notes=(*notes, *pose_notes),
+        registration=registration,
     )
+
+
+def _kinect(depth: Intrinsics, color_size: tuple[int, int]) -> Registration | None:
+    """Where nothing but the camera's own pixels has been stored: images that were registered have another camera."""
+    if depth != KINECT or color_size != (KINECT.width, KINECT.height):
+        return None
+    move = np.eye(4)
+    move[0, 3] = -KINECT_BASELINE_M
+    return Registration(depth, KINECT_COLOR, move)
 
 
 def _camera(folder: Path, size: tuple[int, int]) -> tuple[Intrinsics, tuple[str, ...]]:
