@@ -53,7 +53,7 @@ def make_rays(
     s, far = config.sampling, torch.full_like(pixels.depth, config.depth_far_m)
     if missing:
         poses = c2w.to(far).index_select(0, row)
-        world = (poses[:, :3, :3] @ pixels.direction[:, :, None])[:, :, 0]
+        world = (poses[:, :3, :3] * pixels.direction[:, None, :]).sum(-1)
         far = ray_exit(poses[:, :3, 3], world, box, config.depth_far_m)
     return RayBatch(
         direction=pixels.direction,

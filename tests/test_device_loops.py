@@ -178,7 +178,10 @@ class NoKernels:
 
     sample_depths = staticmethod(reference.sample_depths)
     importance_depths = staticmethod(reference.importance_depths)
-    pose_step = staticmethod(reference.pose_step)
+
+    @staticmethod
+    def pose_step(c2w, d_c2w, moments, rates, count):
+        return c2w + 0 * rates.sum()
 
 
 @pytest.fixture
