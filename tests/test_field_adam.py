@@ -31,3 +31,11 @@ def test_state_moves_to_other_parameters():
     assert grown.count == 1
     grown.step([torch.ones(4), torch.ones(2)], 0.1, 0.1)
     assert (grown.parameters[0] != 0).all()
+
+
+def test_a_step_takes_two_launches(monkeypatch):
+    launched = []
+    monkeypatch.setattr(torch, "_fused_adam_", lambda parameters, *_, **__: launched.append(len(parameters)))
+    numbers = [torch.zeros(2) for _ in range(5)]
+    FieldAdam(numbers).step(numbers, 0.1, 0.2)
+    assert launched == [1, 4]
