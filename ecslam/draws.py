@@ -153,9 +153,9 @@ def device_views(
     row = np.repeat(np.arange(len(views)), shares(len(views), m.rays, m.newest_share))
     return DeviceViews(
         bank.columns,
-        torch.from_numpy(spans).to(device),
-        torch.from_numpy(row[evenly(len(row), m.rays)]).to(device),
-        box.to(device),
+        torch.from_numpy(spans).to(device, non_blocking=True),
+        torch.from_numpy(row[evenly(len(row), m.rays)]).to(device, non_blocking=True),
+        box.to(device, non_blocking=True),
         any(place.missing for place in places),
     )
 

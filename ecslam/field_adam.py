@@ -24,18 +24,19 @@ class FieldAdam:
         self.square = [torch.zeros_like(p) for p in self.parameters]
         self.count = torch.zeros((), device=self.parameters[0].device)
 
-    def step(self, gradients: Sequence[Tensor], rates: Sequence[float | Tensor]) -> None:
-        """One update with a learning rate for each parameter, a number or a tensor [] on the parameters' device."""
+    def step(self, gradients: list[Tensor], first_rate: float | Tensor, rate: float | Tensor) -> None:
+        """One update with a learning rate for the first parameter and one for the others, numbers or tensors [] on the
+        parameters' device: two launches on a GPU, however many parameters there are."""
         self.count += 1
-        for i, rate in enumerate(rates):
+        for part, lr in ((slice(0, 1), first_rate), (slice(1, None), rate)):
             torch._fused_adam_(
-                [self.parameters[i]],
-                [gradients[i]],
-                [self.mean[i]],
-                [self.square[i]],
+                self.parameters[part],
+                gradients[part],
+                self.mean[part],
+                self.square[part],
                 [],
-                [self.count],
-                lr=rate,
+                [self.count] * len(self.parameters[part]),
+                lr=lr,
                 beta1=BETAS[0],
                 beta2=BETAS[1],
                 weight_decay=0.0,

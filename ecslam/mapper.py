@@ -62,10 +62,11 @@ class Job:
         m = self.config.mapping
         return pose_rates(torch.from_numpy(fixed), m.lr_rotation, m.lr_translation)
 
-    def map_rates(self, left: float | Tensor) -> list[float | Tensor]:
-        """Learning rates of the map's parameters when the share ``left`` of the iterations remains."""
-        m, others = self.config.mapping, len(FieldParams.__dataclass_fields__) - 1
-        return [(left if self.settle else 1.0) * rate for rate in (m.lr_grid, *([m.lr_decoder] * others))]
+    def map_rates(self, left: float | Tensor) -> tuple[float | Tensor, float | Tensor]:
+        """Learning rates of the grid and of the map's other parameters when the share ``left`` of the iterations
+        remains."""
+        m, share = self.config.mapping, left if self.settle else 1.0
+        return share * m.lr_grid, share * m.lr_decoder
 
 
 class Mapper:
@@ -107,11 +108,10 @@ class Mapper:
             moved, losses = self._iterate(job, draw, torch.from_numpy(c2w), job.pose_rates(fixed), left, interrupt)
         else:
             moved, losses = self._on_device(job, views, c2w, fixed, iterations, interrupt)
-        sound = torch.stack([t.sum().double() for t in (*self._learnt(), moved)]).isfinite().all()
-        told = torch.cat([moved.reshape(-1), losses[[0, -1]].reshape(-1).to(moved), sound[None].to(moved)]).cpu()
+        sound = torch.stack([*torch._foreach_norm(self._learnt()), moved.float().norm()]).isfinite().all()
+        told = torch.cat([moved.reshape(-1), losses[0].to(moved), losses[-1].to(moved), sound[None].to(moved)]).cpu()
         if not told[-1]:
-            for tensor, kept in zip(self._learnt(), before, strict=True):
-                tensor.copy_(kept)
+            torch._foreach_copy_(self._learnt(), before)
             return MapResult(c2w, {}, float("nan"), failed=True)
         first, last = told[c2w.size : -1].float().view(2, -1)
         poses = told[: c2w.size].view(c2w.shape).numpy()
@@ -132,8 +132,8 @@ class Mapper:
         generator = seeded(self._rng, device)
         still = np.arange(count) >= len(views)
         still[: len(views)] |= fixed
-        poses, rates = torch.from_numpy(padded(c2w, count)).to(device), job.pose_rates(still).to(device)
-        left = (1 - torch.arange(iterations) / max(iterations, 1)).to(device)
+        given = torch.from_numpy(padded(c2w, count)), job.pose_rates(still), 1 - torch.arange(iterations) / iterations
+        poses, rates, left = (t.to(device, non_blocking=True) for t in given)
         chosen, losses = device_views(self._bank, views, count, job.config, self.field.layout.box, device), []
         recorder = Recorder(plain=True) if job.smooth else self.recorder
         for part_left in left.split(max(iterations, 1) if job.move else CHUNK):
@@ -188,7 +188,7 @@ class Mapper:
                 lattice = smooth_lattice(field, m, self._generator)
                 gradient = self.kernels.smoothness(field.layout, field.params.table, lattice)
                 self._gradients.table.add_(gradient, alpha=m.smooth_weight)
-            self._optimiser.step(_tensors(self._gradients), job.map_rates(share))
+            self._optimiser.step(_tensors(self._gradients), *job.map_rates(share))
             field.params.beta.clamp_(min=MIN_BETA)
             if result.d_c2w is not None:
                 poses.step(result.d_c2w, share)
@@ -200,8 +200,7 @@ class Mapper:
         learnt = self._learnt()
         if [t.shape for t in self._spare] != [t.shape for t in learnt]:
             self._spare = [torch.empty_like(t) for t in learnt]
-        for spare, tensor in zip(self._spare, learnt, strict=True):
-            spare.copy_(tensor)
+        torch._foreach_copy_(self._spare, learnt)
         return self._spare
 
     def _learnt(self) -> list[Tensor]:

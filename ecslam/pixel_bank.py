@@ -9,7 +9,6 @@ import torch
 
 from .kernels import DevicePixels
 from .pixels import Pixels
-from .rays import upload
 
 LEAST_ROOM = 1 << 22  # more room is another place, over which loops are recorded anew
 
@@ -44,8 +43,10 @@ class PixelBank:
         if key not in self._places:
             first, last = self._used, self._used + len(view)
             self._require(last)
-            for column, new in zip(self.columns, upload(view, self._device), strict=True):
-                column[first:last] = new
+            held, given = self.columns, (view.direction, view.depth, view.color, view.feature)
+            columns = (held.direction[:, :2], held.depth, held.color, held.feature)
+            for column, new in zip(columns, given, strict=True):
+                column[first:last].copy_(torch.from_numpy(new), non_blocking=True)
             self._places[key], self._used = Place(view, first, bool((view.depth <= 0).any())), last
         return self._places[key]
 
@@ -58,7 +59,7 @@ class PixelBank:
     def _allocate(self, rows: int) -> DevicePixels:
         rows = max(rows, LEAST_ROOM)
         return DevicePixels(
-            torch.zeros(rows, 3, device=self._device),
+            torch.ones(rows, 3, device=self._device),
             torch.zeros(rows, device=self._device),
             torch.zeros(rows, 3, dtype=torch.uint8, device=self._device),
             torch.zeros(rows, dtype=torch.bool, device=self._device),

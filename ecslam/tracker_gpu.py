@@ -55,12 +55,8 @@ class GpuTracker:
         start = torch.from_numpy(guess).to(device, non_blocking=True)
         order = _shuffled(grid_cells(shown, rays, config) if rays else 0, device)
         rates = _rates(t.lr_rotation, t.lr_translation, device)
-        (found,) = self.recorder(
-            partial(self._whole, field, self.volume.blocks, config),
-            *(shown.color, shown.depth, corners, order, start, rates, numbers),
-            key=None,
-            over=(config, field, self.volume.blocks),
-        )
+        over = field, self.volume.blocks, config, shown, order, rates
+        (found,) = self.recorder(partial(self._whole, *over), corners, start, numbers, key=None, over=over)
         pose, (cost, fit, usable), terms = np.split(found.cpu().numpy(), [12, TOLD])
         if usable < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
@@ -72,16 +68,15 @@ class GpuTracker:
         field: TsdfField,
         blocks: Blocks,
         config: Config,
-        color: Tensor,
-        depth: Tensor,
-        corners: Tensor,
+        frame: DeviceFrame,
         order: Tensor,
-        start: Tensor,
         rates: Tensor,
+        corners: Tensor,
+        start: Tensor,
         numbers: Tensor,
     ) -> tuple[Tensor]:
         """Everything as a function of tensors: float64 [TOLD, and the loss terms where frames are rendered]."""
-        frame, a, settings = DeviceFrame(color, depth), config.align, tuple(stages(config))
+        a, settings = config.align, tuple(stages(config))
         cells = grid_cells(frame, a.points, config)
         points = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2))
         packed, first = tracking_gpu.packed(blocks, points, start, LEAST_KNOWN)

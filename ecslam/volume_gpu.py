@@ -58,18 +58,20 @@ class GpuVolume:
         steps = int(np.ceil(2 * self.truncation_m / (0.5 * EDGE * self.voxel_m))) + 1
         blocks, listed, shown = self.blocks, self._listed, self.show(frame)
 
-        def whole(depth: Tensor, color: Tensor, numbers: Tensor) -> tuple[Tensor]:
-            fusion_gpu.fuse(blocks, listed, depth, color, numbers, STRIDE, steps)
+        def whole(numbers: Tensor) -> tuple[Tensor]:
+            fusion_gpu.fuse(blocks, listed, shown.depth, shown.color, numbers, STRIDE, steps)
             return (listed.counts,)
 
-        given = shown.depth, shown.color, self._upload(torch.tensor(numbers, dtype=torch.float64))
-        (counts,) = self._record(whole, *given, key=steps, over=(blocks,))
+        given = self._upload(torch.tensor(numbers, dtype=torch.float64))
+        (counts,) = self._record(whole, given, key=steps, over=(blocks, shown))
         self._taken.copy_(counts, non_blocking=True)
 
     def show(self, frame: Frame) -> DeviceFrame:
-        """The frame's images on the device; the last one's are kept."""
-        if self._shown is None or self._shown[0] is not frame:
-            self._shown = frame, DeviceFrame.of(frame, self._device)
+        """The frame's images on the device, until the next one's, which take their place."""
+        before, place = self._shown or (None, None)
+        if before is not frame:
+            self._shown = frame, DeviceFrame.of(frame, self._device, place)
+        assert self._shown is not None
         return self._shown[1]
 
     def _upload(self, tensor: Tensor) -> Tensor:

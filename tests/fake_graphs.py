@@ -4,6 +4,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "item", "equal")
+PRODUCTS = ("mm", "bmm", "addmm", "baddbmm")
 
 
 class FakeGraphs:
@@ -25,13 +26,16 @@ class FakeGraphs:
 
 class Forbidding(TorchDispatchMode):
     """Raises when an operation would wait for the device, take another number of values each time, or move between
-    devices: what no CUDA graph can record."""
+    devices: what no CUDA graph can record. Nor does it let cuBLAS multiply, which keeps its workspace in the memory of
+    the graph that first asks and may refuse more than 65,535 products at a time."""
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         name = func.overloadpacket.__name__
         if name in WAITS or (name.startswith("index") and any(_is_mask(t) for t in _tensors(args[1:2]))):
             raise AssertionError(f"{func} waits for the device")
+        if name in PRODUCTS:
+            raise AssertionError(f"{func} leaves the work to cuBLAS")
         found = func(*args, **kwargs)
         devices = {t.device.type for t in (*_tensors(args), *_tensors((found,))) if t.dim() > 0}
         if len(devices) > 1:

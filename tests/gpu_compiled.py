@@ -47,13 +47,15 @@ def compile_only(self, *args, **kwargs):
 
 
 def launch_the_map(variants):
-    """Every kernel that ``gpu`` launches, as mapping does; with ``variants`` also as tracking and queries do."""
+    """Every kernel that ``gpu`` launches, as mapping does; with ``variants`` also as tracking and queries do. Those
+    that take another number of points every time are compiled once."""
     field, (c2w, rays) = make_field(FieldConfig()), make_rays(64, 64)
-    layout, params, points = field.layout, field.params, make_points(100)
-    gpu.gradients(layout, params, points)
+    layout, params = field.layout, field.params
+    for points in (make_points(count) for count in (100, 96, 1)):
+        gpu.gradients(layout, params, points)
+        gpu.normal_equations(layout, params, c2w[0], points, points[:, 0].contiguous(), ALIGN)
     gpu.render(layout, params, c2w, rays)
     gpu.step(layout, params, c2w, rays, WEIGHTS, blank(params), True)
-    gpu.normal_equations(layout, params, c2w[0], points, points[:, 0].contiguous(), ALIGN)
     poses = torch.eye(4).double().repeat(30, 1, 1)
     mean, square, rates = (torch.zeros(30, 6).double() for _ in range(3))
     moments = PoseMoments(mean, square, torch.zeros(30, 3).double(), (0.5, 0.9), 1e-8)

@@ -3,6 +3,8 @@
 Not collected by itself: ``test_kernels_gpu.py`` runs it in a process of its own (see ``gpu_checks.py``).
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -73,6 +75,16 @@ def rays_at(frame, v, u):
     d = frame.depth[v, u]
     direction = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(len(u))], 1)
     return direction, np.where((d >= CONFIG.depth_near_m) & (d <= CONFIG.depth_far_m), d, 0)
+
+
+def test_a_frame_takes_the_place_of_one_of_its_size(seen):
+    depth, nearer = seen.depth.copy(), replace(seen, depth=0.5 * seen.depth)
+    place = DeviceFrame.of(seen, DEVICE)
+    assert DeviceFrame.of(nearer, DEVICE, place) is place
+    np.testing.assert_array_equal(place.depth.cpu(), nearer.depth)
+    np.testing.assert_array_equal(seen.depth, depth)
+    other = DeviceFrame.of(replace(seen, depth=depth[1:], color=seen.color[1:]), DEVICE, place)
+    assert other.depth.shape == (len(depth) - 1, depth.shape[1])
 
 
 @pytest.mark.parametrize("count", [1, 128, 300])

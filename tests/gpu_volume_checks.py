@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from fake_graphs import Forbidding, launch_nothing
+from fake_graphs import FakeGraphs, Forbidding, launch_nothing
 from kernel_cases import relative_rms
 from on_gpu import DEVICE, INTERPRETED, moved
 from planes import corner, look, pose
@@ -113,6 +113,14 @@ def pair():
 
 def test_frames_are_averaged_in_as_on_the_cpu(pair):
     assert_alike(*pair)
+
+
+def test_replays_average_in_what_plain_calls_do(pair):
+    graphs = FakeGraphs()
+    mine = GpuVolume(*LENGTHS, DEVICE, Recorder(capture=graphs.capture))
+    add(mine, corners())
+    assert_alike(pair[0], mine)
+    assert (graphs.recorded, graphs.replayed) == (1, 2)
 
 
 @pytest.mark.parametrize("width", [48, 47])
@@ -308,6 +316,18 @@ def test_a_frame_is_tracked_as_on_the_host(pair):
             assert 0 < found.losses["align_mm"] < 5
 
 
+def test_a_replay_sees_the_newest_frame(pair):
+    graphs, found = FakeGraphs(), []
+    for recorder in (Recorder(plain=True), Recorder(capture=graphs.capture)):
+        _, (tracker, field) = trackers(pair)
+        for c2w in (TRUE, TRUE, pose((1, 4, -2), (0.03, 0.02, -0.01))):
+            track = replace(tracker, recorder=recorder).track(look(c2w, corner(), CAMERA), GUESS, field, TINY)
+            found.append(track.c2w)
+    np.testing.assert_allclose(found[3:], found[:3], atol=1e-4)
+    assert np.abs(found[2] - found[1]).max() > 0.01
+    assert (graphs.recorded, graphs.replayed) == (1, 2)
+
+
 def test_a_rendered_pose_is_taken_only_where_the_surface_agrees(pair):
     seen = look(TRUE, corner(), CAMERA)
     rendered = replace(TINY, tracking=TrackingConfig(iterations=2, rays=60, lr_rotation=1e-5, lr_translation=1e-5))
@@ -345,8 +365,8 @@ def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     numbers = torch.zeros(2 * cells + 60 * (3 + 7), device=meta)
     corners, order = (torch.zeros(n, dtype=torch.int64, device=meta) for n in (20 if fus else 0, order))
     start, rates = (torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((4, 4), (1, 6)))
-    given = shown.color, shown.depth, corners, order, start, rates, numbers
-    tracker._whole(field, blocks, config, *given)  # uploads the layout, once
+    given = field, blocks, config, shown, order, rates, corners, start, numbers
+    tracker._whole(*given)  # uploads the layout, once
     with Forbidding():
-        (found,) = tracker._whole(field, blocks, config, *given)
+        (found,) = tracker._whole(*given)
     assert found.shape == (TOLD + len(LOSS_NAMES),)

@@ -1,12 +1,14 @@
 """Mapping and tracking as a GPU does them, on the CPU: rays drawn on the device, loops that a CUDA graph can record."""
 
 from dataclasses import fields
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from fake_graphs import FakeGraphs, Forbidding
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from ecslam import field_adam
 from ecslam import kernels as seam
@@ -178,7 +180,10 @@ class NoKernels:
 
     sample_depths = staticmethod(reference.sample_depths)
     importance_depths = staticmethod(reference.importance_depths)
-    pose_step = staticmethod(reference.pose_step)
+
+    @staticmethod
+    def pose_step(c2w, d_c2w, moments, rates, count):
+        return c2w + 0 * rates.sum()
 
 
 @pytest.fixture
@@ -188,18 +193,18 @@ def gpu(monkeypatch):
     return torch.device("meta")
 
 
+def empty_mapper(device):
+    """With a map of the right sizes that holds no numbers."""
+    shapes = ((50, 2), (80, 64), (32, 1), (32, 3), (1,))
+    params = FieldParams(*(torch.empty(shape, device=device) for shape in shapes))
+    layout = SimpleNamespace(box=torch.from_numpy(BOX).float())
+    return Mapper(SimpleNamespace(device=device, layout=layout, params=params), NoKernels, 0)
+
+
 @pytest.mark.parametrize("missing", [False, True])
 @pytest.mark.parametrize("settle", [False, True])
 def test_no_iteration_of_a_mapping_waits_for_the_gpu(gpu, config, missing, settle):
-    def on_gpu(*shape, dtype=torch.float32):
-        return torch.empty(shape, dtype=dtype, device=gpu)
-
-    field = SimpleNamespace(
-        device=gpu,
-        layout=None,
-        params=FieldParams(on_gpu(50, 2), on_gpu(80, 64), on_gpu(32, 1), on_gpu(32, 3), on_gpu(1)),
-    )
-    one = Mapper(field, NoKernels, 0)
+    one, on_gpu = empty_mapper(gpu), partial(torch.empty, device=gpu)
     s, m, poses = config.sampling, config.mapping, 5
     job = Job(config, move=not settle, smooth=False, settle=settle)
     draws = on_gpu(4, m.rays, 1 + s.uniform + (2 if missing else 1) * s.near_depth)
@@ -210,6 +215,26 @@ def test_no_iteration_of_a_mapping_waits_for_the_gpu(gpu, config, missing, settl
             on_gpu(m.rays, dtype=torch.int64), on_gpu(2, 3), draws,
         )  # fmt: skip
     assert (c2w.device.type, c2w.shape, losses.shape) == ("meta", (5, 4, 4), (4, 5))
+
+
+class Sending(TorchDispatchMode):
+    """Raises when something is sent to a device that the host would wait for."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        sent = func.overloadpacket.__name__ == "_to_copy" and kwargs.get("device", CPU) != CPU
+        assert kwargs.get("non_blocking") or not sent, f"{func} waits for the device"
+        return func(*args, **kwargs)
+
+
+def test_what_a_mapping_needs_is_sent_without_waiting(gpu, config, room, monkeypatch):
+    monkeypatch.setattr("ecslam.mapper.seeded", lambda rng, device: None)
+    monkeypatch.setattr("ecslam.mapper.uniform", lambda generator, device, *shape: torch.empty(shape, device=device))
+    one, (views, poses) = empty_mapper(gpu), keyframes(room, config)
+    job = Job(config, move=True, smooth=False, settle=False)
+    with Sending():
+        c2w, losses = one._on_device(job, views, poses, np.arange(3) == 0, 4, lambda: None)
+    assert (c2w.device.type, c2w.shape, losses.shape) == ("meta", (3, 4, 4), (4, 5))
 
 
 def test_no_iteration_of_tracking_waits_for_the_gpu(gpu):

@@ -30,6 +30,8 @@ def test_every_kernel_compiles(wanted, tmp_path):
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     reports = [json.loads(line) for line in done.stdout.splitlines()]
-    assert {report["kernel"] for report in reports} == launched()
+    names = [report["kernel"] for report in reports]
+    assert set(names) == launched()
+    assert names.count("gradients_kernel") == names.count("align_kernel") == 1
     assert all(report["cubin"] > 1000 for report in reports)
     assert {report["kernel"] for report in reports if report["spilled"]} <= SPILLING

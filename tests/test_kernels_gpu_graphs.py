@@ -1,10 +1,13 @@
 """Recorded loops: what is run plainly, what is replayed, and what happens when recording is impossible."""
 
+from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
+
 import pytest
 import torch
 from fake_graphs import FakeGraphs
 
-from ecslam.kernels.graphs import Recorder
+from ecslam.kernels.graphs import Recorder, capture_cuda
 
 
 def sum_and_difference(a, b):
@@ -106,6 +109,44 @@ def test_where_recording_fails_everything_runs_plainly():
         assert torch.equal(recorder(sum_and_difference, *pair(x), key=0)[0], sum_and_difference(*pair(x))[0])
     assert len(tried) == 1
     assert "not permitted" in recorder.failure
+
+
+def test_after_a_recording_that_fails_the_thread_is_in_its_own_stream(monkeypatch):
+    now = ["own"]
+
+    @contextmanager
+    def stream(entered):
+        before, now[0] = now[0], entered
+        try:
+            yield
+        finally:
+            now[0] = before
+
+    class Graph:
+        """Like torch's, which restores no stream when the recording cannot be ended."""
+
+        def __init__(self, graph, capture_error_mode):
+            assert capture_error_mode == "thread_local"
+
+        def __enter__(self):
+            now[0] = "recording"
+
+        def __exit__(self, *error):
+            now[0] = "recording" if error[0] else "own"
+
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=None))
+    monkeypatch.setattr(torch.cuda, "graph", Graph)
+    monkeypatch.setattr(torch.cuda, "stream", stream)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: now[0])
+
+    def refuse():
+        assert now == ["recording"]
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    with pytest.raises(RuntimeError, match="not permitted"):
+        capture_cuda(refuse, torch.device("cuda"))
+    assert now == ["own"]
 
 
 def test_a_mistake_of_the_function_itself_is_not_swallowed():

@@ -79,6 +79,17 @@ def test_images_for_a_gpu_are_put_where_it_can_fetch_them(monkeypatch):
     assert np.array_equal(prepared.depth, frame.depth + 1)
 
 
+def test_a_copy_for_a_gpu_is_in_one_piece_however_the_image_lies_in_memory(monkeypatch):
+    empty = torch.empty
+    monkeypatch.setattr(torch, "empty", lambda *size, pin_memory, **how: empty(*size, **how))
+    for image in (ROOM[0].color[..., ::-1], ROOM[0].depth[:, 1:]):
+        copy = ahead.pinned(image)
+        assert copy is not image
+        assert copy.flags.c_contiguous
+        assert copy.dtype == image.dtype
+        assert np.array_equal(copy, image)
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has it")
 def test_without_page_locked_memory_images_stay_where_they_are():
     frame = ROOM[0]

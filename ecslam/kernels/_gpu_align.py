@@ -48,11 +48,13 @@ def both_gradients(field, world, live, colour: tl.constexpr, shape: tl.constexpr
     return sdf, (sdf_x, sdf_y, sdf_z), luminance, (gx, gy, gz)
 
 
-@triton.jit
-def gradients_kernel(field, points, sdf, d_sdf, luminance, d_luminance, shape: tl.constexpr, block: tl.constexpr):
+@triton.jit(do_not_specialize=["total"])
+def gradients_kernel(
+    field, points, total, sdf, d_sdf, luminance, d_luminance, shape: tl.constexpr, block: tl.constexpr
+):  # fmt: skip
     """TSDF [N], its gradient [N, 3], luminance [N], its gradient [N, 3] at ``points.position`` [N, 3] in the world."""
     i = tl.program_id(0) * block + tl.arange(0, block)
-    live = i < points.total
+    live = i < total
     found = both_gradients(field, triple(points.position + 3 * i, live), live, True, shape)
     tl.store(sdf + i, found[0], live)
     tl.store(luminance + i, found[2], live)
@@ -103,14 +105,14 @@ def add_points(sums, value, gradient, light, d_light, seen, lever, settings, liv
         add_products(sums, (light - seen) * scale, d_error, lever, colour_kernel * scale, keep)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["total"])
 def align_kernel(
-    field, points, luminance, settings, sums, colour: tl.constexpr, shape: tl.constexpr, block: tl.constexpr
+    field, points, total, luminance, settings, sums, colour: tl.constexpr, shape: tl.constexpr, block: tl.constexpr
 ):
     """Add a block's share to ``sums`` float64 [67]. points.position: camera points; settings: the fields of
     ``AlignSettings`` in their order."""
     i = tl.program_id(0) * block + tl.arange(0, block)
-    live = i < points.total
+    live = i < total
     local = triple(points.position + 3 * i, live)
     world = (moved(points.c2w, local, 0), moved(points.c2w, local, 1), moved(points.c2w, local, 2))
     tx, ty, tz = tl.load(points.c2w + 3), tl.load(points.c2w + 7), tl.load(points.c2w + 11)

@@ -14,7 +14,7 @@ def at_index(values, step, index):
     return tl.sum(tl.where(step == index[:, None], values, 0.0), 1)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rays"])
 def importance_kernel(z, weights, jitter, out, rays, samples, count, block: tl.constexpr, padded: tl.constexpr):
     """Ascending depths ``out`` [R, S + K]: z [R, S] and K drawn from their rendering weights by ``jitter`` [R, K].
 

@@ -39,7 +39,6 @@ class Points(NamedTuple):
     pose: Tensor
     pitch: int
     samples: int
-    total: int
 
 
 class Into(NamedTuple):
@@ -100,17 +99,17 @@ def world_of(points, i, live, from_rays: tl.constexpr):
         return triple(points.position + 3 * i, live)
 
 
-@triton.jit
-def place_kernel(field, points, placed, from_rays: tl.constexpr, shape: tl.constexpr, block: tl.constexpr):
+@triton.jit(do_not_specialize=["total"])
+def place_kernel(field, points, total, placed, from_rays: tl.constexpr, shape: tl.constexpr, block: tl.constexpr):
     """Place points: ``placed`` [12, N] takes their distances from the anchor (x, y, z), what rounding lost, their
     one-blob phases, and 1 for coordinates inside the box, else 0."""
     i = tl.program_id(0) * block + tl.arange(0, block)
-    live = i < points.total
+    live = i < total
     world = world_of(points, i, live, from_rays)
     for axis in tl.static_range(3):
         found = on_box(field, world[axis], axis, shape)
         for kind in tl.static_range(4):
-            tl.store(placed + (3 * kind + axis) * points.total + i, found[kind], live)
+            tl.store(placed + (3 * kind + axis) * total + i, found[kind], live)
 
 
 @triton.jit

@@ -93,12 +93,12 @@ def _shape(layout: GridLayout) -> Shape:
 def _places(points: Tensor, c2w: Tensor | None = None) -> Points:
     """Points given by their positions: in the world, or in one camera of ``c2w`` [3 or 4, 4]."""
     place = _flat(points)
-    return Points(place, place if c2w is None else _flat(c2w), place, place, place, 0, 0, place.shape[0])
+    return Points(place, place if c2w is None else _flat(c2w), place, place, place, 0, 0)
 
 
 def _samples(c2w: Tensor, rays: RayBatch) -> Points:
     poses, z = _flat(c2w), _flat(rays.z)
-    return Points(z, poses, _flat(rays.direction), z, rays.pose.contiguous(), 4 * poses.shape[1], z.shape[1], z.numel())
+    return Points(z, poses, _flat(rays.direction), z, rays.pose.contiguous(), 4 * poses.shape[1], z.shape[1])
 
 
 def _targets(rays: RayBatch) -> Targets:
@@ -117,12 +117,12 @@ def _ray_grid(rays: int, samples: int) -> tuple[tuple[int], dict[str, int]]:
     return (-(-rays // block),), {"block": block, "padded": padded}
 
 
-def _place(layout: GridLayout, field: Field, points: Points, from_rays: bool) -> Tensor:
-    """Where points lie, as ``place_kernel`` has it [12, N]."""
-    placed = points.position.new_empty(12, points.total)
-    if points.total:
-        place_kernel[(_blocks(points.total, PLACE_BLOCK),)](
-            field, points, placed, from_rays=from_rays, shape=_shape(layout), block=PLACE_BLOCK
+def _place(layout: GridLayout, field: Field, points: Points, total: int, from_rays: bool) -> Tensor:
+    """Where so many points lie, as ``place_kernel`` has it [12, N]."""
+    placed = points.position.new_empty(12, total)
+    if total:
+        place_kernel[(_blocks(total, PLACE_BLOCK),)](
+            field, points, total, placed, from_rays=from_rays, shape=_shape(layout), block=PLACE_BLOCK
         )
     return placed
 
@@ -146,7 +146,7 @@ def values(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Ten
     """See ``reference.values``."""
     with beside(points):
         field = _field(layout, params)
-        return _evaluate(layout, field, _place(layout, field, _places(points), False))
+        return _evaluate(layout, field, _place(layout, field, _places(points), len(points), False))
 
 
 def gradients(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -157,8 +157,9 @@ def gradients(layout: GridLayout, params: FieldParams, points: Tensor) -> tuple[
     if n:
         with beside(points):
             gradients_kernel[(_blocks(n, ALIGN_BLOCK),)](
-                _field(layout, params), given, *found, shape=_shape(layout), block=ALIGN_BLOCK, num_warps=ALIGN_WARPS
-            )
+                _field(layout, params), given, n, *found,
+                shape=_shape(layout), block=ALIGN_BLOCK, num_warps=ALIGN_WARPS,
+            )  # fmt: skip
     return found
 
 
@@ -172,7 +173,7 @@ def render(layout: GridLayout, params: FieldParams, c2w: Tensor, rays: RayBatch)
         grid, sizes = _ray_grid(targets.rays, targets.samples)
         with beside(z):
             field = _field(layout, params)
-            sdf, rgb = _evaluate(layout, field, _place(layout, field, _samples(c2w, rays), True))
+            sdf, rgb = _evaluate(layout, field, _place(layout, field, _samples(c2w, rays), z.numel(), True))
             render_kernel[grid](targets, sdf, rgb, _flat(params.beta), color, depth, weights, **sizes)
     return color, depth, weights
 
@@ -210,7 +211,8 @@ def _step(
 ) -> None:
     """Add to ``losses``, to ``into`` and to ``d_c2w``, where they are wanted."""
     field, beta, shape = _field(layout, params), _flat(params.beta), _shape(layout)
-    total, placed = points.total, _place(layout, field, points, True)
+    total = targets.z.numel()
+    placed = _place(layout, field, points, total, True)
     of_features, hidden = (2, layout.levels, total), beta.new_empty(total, 2 * HIDDEN)
     features = None if into is None else beta.new_empty(of_features)
     slopes = None if d_c2w is None else beta.new_empty(3, *of_features)
@@ -252,7 +254,7 @@ def normal_equations(
         numbers = settings.numbers()
         with beside(points):
             align_kernel[(_blocks(n, ALIGN_BLOCK),)](
-                _field(layout, params), _places(points, c2w), _flat(luminance), numbers, sums,
+                _field(layout, params), _places(points, c2w), n, _flat(luminance), numbers, sums,
                 colour=settings.colour_weight > 0, shape=_shape(layout), block=ALIGN_BLOCK, num_warps=ALIGN_WARPS,
             )  # fmt: skip
     total = sums.cpu()

@@ -33,9 +33,10 @@ class _Held:
 def capture_cuda(function: Callable[[], Tensors], device: torch.device) -> tuple[Callable[[], None], Tensors]:
     """Record ``function`` without running it: how to replay it, and where its results then lie.
 
-    Only this thread's calls count as forbidden ones: tracking and mapping may use the device at the same time.
+    Only this thread's calls count as forbidden ones: tracking and mapping may use the device at the same time. After a
+    recording that fails torch stays in the stream it recorded in, so the thread's own one is taken up again here.
     """
-    with _recording, torch.cuda.device(device):
+    with _recording, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             outputs = function()

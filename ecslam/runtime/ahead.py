@@ -36,10 +36,14 @@ def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -
 
 
 def pinned(array: np.ndarray) -> np.ndarray:
-    """A copy in page-locked memory, or the array itself where there is none to be had."""
+    """A copy in page-locked memory, or the array itself where there is none to be had. numpy copies alone, torch would
+    wake all its threads in each of the threads that read."""
     import torch
 
     try:
-        return np.asarray(torch.from_numpy(array).pin_memory().numpy())
+        held = torch.empty(array.nbytes, dtype=torch.uint8, pin_memory=True)
     except RuntimeError:
         return array
+    copy = held.numpy().view(array.dtype).reshape(array.shape)
+    np.copyto(copy, array)
+    return copy

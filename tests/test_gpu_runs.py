@@ -1,0 +1,49 @@
+"""Whole runs on a GPU: every loop is recorded and replayed, in both schedules, and the camera is followed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ecslam.config_files import apply_settings, load_preset
+from ecslam.datasets import open_sequence
+from ecslam.slam import Slam
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
+FRAMES = 40
+
+
+@pytest.fixture(scope="module")
+def frames():
+    room = open_sequence("synthetic/studio?size=320x240&frames=400")
+    return room, [room[i] for i in range(FRAMES)]
+
+
+def replays(recorder):
+    """How many graphs it holds that are ready to be replayed."""
+    return sum(held.replay is not None for held in recorder._held.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("holes", [0.0, 0.1])
+@pytest.mark.parametrize("schedule", ["strict", "overlap"])
+@pytest.mark.parametrize("preset", ["live", "lite", "full"])
+def test_a_run_replays_its_loops_and_follows_the_camera(frames, preset, schedule, holes):
+    room, seen = frames
+    config = apply_settings(load_preset(preset), [f"schedule={schedule}", "mapping.final_iterations=30"])
+    rng, first = np.random.default_rng(0), seen[0].c2w_gt
+    slam = Slam(config, room.intrinsics, device=torch.device("cuda"), bounds=room.bounds, first_pose=first)
+    for frame in seen:
+        there = rng.random(frame.depth.shape) >= holes
+        report = slam.step(replace(frame, depth=frame.depth * there))
+        assert report.tracked
+        assert np.isfinite(list(report.losses.values())).all()
+        assert "graph" not in report.note
+    slam.finish()
+    tracking, mapping = slam._follower.recorder, slam.mapper.recorder
+    assert (tracking.failure, mapping.failure) == ("", "")
+    assert replays(tracking) >= 2
+    assert replays(mapping) >= 2
+    off = slam.trajectory.poses()[:, :3, 3] - np.stack([frame.c2w_gt[:3, 3] for frame in seen])
+    assert np.sqrt(np.square(off).sum(1).mean()) < 0.02
