@@ -161,6 +161,22 @@ def test_the_file_beside_it_tells_the_camera_of_depth(tmp_path: Path) -> None:
     assert "camera-intrinsics.txt: focal lengths 0 and 0" in refusal(path)
 
 
+def send_infrared(r: Robot) -> None:
+    """Beside depth, joined to it, and with a camera."""
+    r.transform(START - 9, FRAMES[1], "infra", np.eye(4), "/tf_static")
+    r.camera("/camera/infra1/camera_info", DEPTH.matrix(), (DEPTH.width, DEPTH.height))
+    for i in range(N):
+        dark = np.zeros((DEPTH.height, DEPTH.width), np.uint8)
+        r.image("/camera/infra1/image_rect_raw", START + i / 30, dark, "mono8", frame="infra")
+
+
+def test_infrared_is_not_taken_for_colour_that_is_there(tmp_path: Path) -> None:
+    assert_registered(opened(write(tmp_path / "a", send_infos, send_images, send_mount, send_infrared)))
+    assert f"there is no {COLOR_INFO} in it" in refusal(
+        write(tmp_path / "b", info_of_depth, send_images, send_mount, send_infrared)
+    )
+
+
 def send_rigs(r: Robot) -> None:
     """Two cameras of one kind, looking the same way."""
     for name, place in (("front", MOUNT), ("side", motion(move=(0, 0.4, 0)) @ MOUNT)):

@@ -137,8 +137,10 @@ def _registered(pairs: list[Pair]) -> list[Pair]:
 
 
 def _joined(recording: Recording, pairs: list[Pair]) -> tuple[list[Pair], str]:
-    """Those whose cameras are known and do not move against each other, or why the most usual is not among them."""
+    """Those whose cameras are known and do not move against each other, or why the most usual is not among them. No
+    infrared takes the place of colour that there is."""
     why = ""
+    pairs = [pair for pair in pairs if pair.color.kind.encoding not in GREY] or pairs
     for most in (LOOKED_AT, None):  # few transforms tell of cameras that are joined, all that they are not
         links = links_of(recording, most) | stream_links(recording)
         found = []
