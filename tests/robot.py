@@ -85,11 +85,13 @@ class Robot:
         self.send(topic, self.type("sensor_msgs/msg/CameraInfo")(**fields))
 
     def transform(self, time: float, parent: str, child: str, pose: np.ndarray, topic: str = "/tf") -> None:
-        move = self.type("geometry_msgs/msg/Vector3")(*pose[:3, 3])
-        turn = self.type("geometry_msgs/msg/Quaternion")(*Rotation.from_matrix(pose[:3, :3]).as_quat())
-        transform = self.type("geometry_msgs/msg/Transform")(move, turn)
-        stamped = self.type("geometry_msgs/msg/TransformStamped")(self.header(time, parent), child, transform)
+        stamped = self.type("geometry_msgs/msg/TransformStamped")(self.header(time, parent), child, self.motion(pose))
         self.send(topic, self.type(TRANSFORMS)([stamped]))
+
+    def motion(self, matrix: np.ndarray) -> Any:
+        move = self.type("geometry_msgs/msg/Vector3")(*matrix[:3, 3])
+        turn = self.type("geometry_msgs/msg/Quaternion")(*Rotation.from_matrix(matrix[:3, :3]).as_quat())
+        return self.type("geometry_msgs/msg/Transform")(move, turn)
 
 
 @contextmanager

@@ -1,7 +1,8 @@
-"""ROS: a .bag, .mcap or .db3 file or a rosbag2 folder, with colour, depth registered to it and CameraInfo.
+"""ROS: a .bag, .mcap or .db3 file or a rosbag2 folder, with colour, depth and CameraInfo.
 
-Of ROS 1 and 2. A pose belongs to the recording's ground truth only where transforms lead from a frame called ``world``
-to the camera; odometry is an estimate, and of another frame.
+Of ROS 1 and 2. Depth that is registered to colour is taken as it is; where there is none, colour is moved to depth, by
+the CameraInfo of both and the transforms between their frames. A pose belongs to the recording's ground truth only
+where transforms lead from a frame called ``world`` to the camera; odometry is an estimate, and of another frame.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from numpy.typing import NDArray
 
 from ..types import InputError
 from .files import FileSequence
-from .reading import same_shape
+from .roscameras import cameras_of, units_per_m
 from .rosfiles import Place
 from .rosimages import color_of, depth_of
 from .rosmessages import Recording
-from .rostopics import Topic, camera_of, choose
+from .rostopics import Topic, choose
 from .rostruth import true_poses
 from .tum import MAX_DIFFERENCE_S, associate
 
@@ -50,15 +51,17 @@ class RosRecording(FileSequence):
         message = self.recording.message(self.color.name, self.color_places[index])
         color = color_of(message, self.color_size, f"{self.recording.path}: {self.color.name} of frame {index}")
         message = self.recording.message(self.depth.name, self.depth_places[index])
-        return color, depth_of(message, size, f"{self.recording.path}: {self.depth.name} of frame {index}")
+        place = f"{self.recording.path}: {self.depth.name} of frame {index}"
+        return color, depth_of(message, size, self.depth_scale, place)
 
 
 def open(path: Path, color: str = "", depth: str = "") -> RosRecording:
     """Open it. color, depth: topics, where it has several. Raises InputError."""
     recording = Recording(path, _parts(path))
-    color_topic, depth_topic = choose(recording, color, depth)
-    same_shape(color_topic.kind.size, depth_topic.kind.size, path)
-    camera, camera_notes = camera_of(recording, color_topic, depth_topic)
+    pair = choose(recording, color, depth)
+    color_topic, depth_topic = pair.color, pair.depth
+    cameras = cameras_of(recording, pair)
+    scale, scale_notes = units_per_m(recording, depth_topic)
     color_places, depth_places = recording.places[color_topic.name], recording.places[depth_topic.name]
     color_times, depth_times = _times(color_places), _times(depth_places)
     pairs = associate(color_times, depth_times, MAX_DIFFERENCE_S)
@@ -68,7 +71,8 @@ def open(path: Path, color: str = "", depth: str = "") -> RosRecording:
             "are both stamped by one clock?"
         )
     times = depth_times[pairs[:, 1]]
-    poses, pose_notes = true_poses(recording, color_topic.kind.frame, times)
+    taken_by = color_topic if cameras.registration is None else depth_topic
+    poses, pose_notes = true_poses(recording, taken_by.kind.frame, times)
     recording.places.clear()  # hundreds of bytes for each transform
     dropped = len(color_times) - len(pairs), len(depth_times) - len(pairs)
     unpaired = f"{dropped[0]} colour and {dropped[1]} depth images have no partner within 20 ms and are left out"
@@ -76,14 +80,15 @@ def open(path: Path, color: str = "", depth: str = "") -> RosRecording:
         name=path.name if path.is_dir() else path.stem,
         layout="rosbag",
         preset="lite",
-        intrinsics=camera,
+        intrinsics=cameras.frames,
         color_files=[],
         depth_files=[],
-        depth_scale=1.0,
+        depth_scale=scale,
         times=times,
         poses=poses,
         color_size=color_topic.kind.size,
-        notes=(*recording.lost, *((unpaired,) if any(dropped) else ()), *camera_notes, *pose_notes),
+        notes=(*recording.lost, *((unpaired,) if any(dropped) else ()), *cameras.notes, *scale_notes, *pose_notes),
+        registration=cameras.registration,
         recording=recording,
         color=color_topic,
         depth=depth_topic,

@@ -30,8 +30,7 @@ COLORS = {  # encoding: channels, and how OpenCV makes RGB of it
 }
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 GREY = ("mono8", "8UC1", "mono16")
-UNITS_PER_M = 1000.0
-UNNAMED = "0"  # the frame of all images that RealSense's own viewer records, depth not registered
+UNNAMED = "0"  # the frame of all images that librealsense records, depth not registered
 PACKED_HEADER = struct.Struct("<iff")
 
 
@@ -88,17 +87,17 @@ def color_of(message: Any, size: tuple[int, int], place: str) -> NDArray[np.uint
     return cast("NDArray[np.uint8]", cv2.cvtColor(np.ascontiguousarray(rows), conversion))
 
 
-def depth_of(message: Any, size: tuple[int, int], place: str) -> NDArray[np.float32]:
-    """Metres float32 [H, W], 0 = none, from an Image or CompressedImage of (width, height) ``size``. Raises
-    FrameError."""
+def depth_of(message: Any, size: tuple[int, int], scale: float, place: str) -> NDArray[np.float32]:
+    """Metres float32 [H, W], 0 = none, from an Image or CompressedImage of (width, height) ``size``. scale: units per
+    metre of 16 bits. Raises FrameError."""
     if not hasattr(message, "encoding"):
-        return _unpacked_depth(message, size, place)
+        return _unpacked_depth(message, size, scale, place)
     if message.encoding not in DEPTHS:
         raise FrameError(f"{place}: encoding {message.encoding!r}, which is no depth; record 16UC1 or 32FC1")
     kind = (">" if message.is_bigendian else "<") + DEPTHS[message.encoding]
     values = _rows(message, kind, 1, size, place)[..., 0]
     if kind.endswith("u2"):
-        return to_metres(values.astype(np.uint16), UNITS_PER_M)
+        return to_metres(values.astype(np.uint16), scale)
     return _known(values.astype(np.float32))
 
 
@@ -113,15 +112,15 @@ def _rows(message: Any, kind: str, channels: int, size: tuple[int, int], place: 
     return np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)
 
 
-def _unpacked_depth(message: Any, size: tuple[int, int], place: str) -> NDArray[np.float32]:
+def _unpacked_depth(message: Any, size: tuple[int, int], scale: float, place: str) -> NDArray[np.float32]:
     encoding, packed = _packed(message)
     data = message.data.tobytes()
     if not packed:
-        return to_metres(decode_depth(place, data, size), UNITS_PER_M)
+        return to_metres(decode_depth(place, data, size), scale)
     _, a, b = PACKED_HEADER.unpack_from(data)
     raw = decode_depth(place, data[PACKED_HEADER.size :], size)
     if encoding != "32FC1":
-        return to_metres(raw, UNITS_PER_M)
+        return to_metres(raw, scale)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return _known(np.where(raw > 0, np.float32(a) / (raw.astype(np.float32) - np.float32(b)), np.float32(0)))
 

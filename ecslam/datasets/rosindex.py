@@ -10,7 +10,7 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -37,6 +37,7 @@ GLANCE = 192  # bytes of a record that are read in passing
 MOST_ABOUT_BYTES = 16 << 20  # of what describes a topic
 STAMP = slice(4, 12)  # of a message that begins with a header; before it a number (ROS 1) or how it is encoded (ROS 2)
 BAG_MAGIC, MCAP_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"
+Wanted = Callable[[str, str], bool]
 
 
 @dataclass
@@ -50,8 +51,8 @@ class Index:
     lost: list[str] = field(default_factory=list)
 
 
-def find_messages(files: list[Path], wanted: frozenset[str]) -> Index:
-    """Of the ``wanted`` types, in the ``files`` of one recording. Raises InputError."""
+def find_messages(files: list[Path], wanted: Wanted) -> Index:
+    """Of topics and their types that are ``wanted``, in the ``files`` of one recording. Raises InputError."""
     index = Index()
     walks = {".bag": _BagWalk, ".mcap": _McapWalk, ".db3": _SqliteWalk}
     for file in files:
@@ -71,11 +72,12 @@ def find_messages(files: list[Path], wanted: frozenset[str]) -> Index:
 
 
 class _Walk:
-    """Over one file. topics: by connection, as that format calls its channels."""
+    """Over one file. topics: by connection, as that format calls its channels. kept: connections that are wanted."""
 
-    def __init__(self, file: Path, index: Index, wanted: frozenset[str]) -> None:
+    def __init__(self, file: Path, index: Index, wanted: Wanted) -> None:
         self.file, self.index, self.wanted = file, index, wanted
         self.topics: dict[object, str] = {}
+        self.kept: set[object] = set()
         self.damaged_chunks = 0
         self._pool = ThreadPoolExecutor(workers())
         self._coming: deque[tuple[Chunk, Future[bytes]]] = deque()
@@ -87,10 +89,8 @@ class _Walk:
     def topic(self, connection: object, name: str, kind: str) -> None:
         package, _, rest = kind.partition("/")
         name = self.topics[connection] = printable(name)
-        self.index.types[name] = f"{package}/msg/{rest.removeprefix('msg/')}"
-
-    def wants(self, connection: object) -> bool:
-        return self.index.types.get(self.topics.get(connection, "")) in self.wanted
+        kind = self.index.types[name] = f"{package}/msg/{rest.removeprefix('msg/')}"
+        (self.kept.add if self.wanted(name, kind) else self.kept.discard)(connection)
 
     def packed(self, data: bytes, chunk: Chunk) -> None:
         """The records of a compressed chunk, later: threads unpack. A damaged one costs no other."""
@@ -142,7 +142,7 @@ class _BagWalk(_Walk):
                 self._chunk(stream, at, size, min(at + size, end), fields)
             if at + size > end:
                 raise DamagedError("its last record is cut off")
-            if kind == b"\x02" and self.wants(connection):
+            if kind == b"\x02" and connection in self.kept:
                 seconds, rest = fields[b"time"][:4], fields[b"time"][4:]
                 time_ns = 10**9 * int.from_bytes(seconds, "little") + int.from_bytes(rest, "little")
                 self.message(connection, time_ns, chunk, at, size, start)
@@ -212,7 +212,7 @@ class _McapWalk(_Walk):
                 raise DamagedError("its last record is cut off")
             if kind == 0x05:
                 connection, _, time_ns, _ = _Cursor(glance[9:]).numbers("<HIQQ")
-                if self.wants(connection) and size >= 22:
+                if connection in self.kept and size >= 22:
                     self._message(stream, connection, time_ns, chunk, at + 22, size - 22, glance[31:])
             at += size
         if not inside:
@@ -273,7 +273,7 @@ class _SqliteWalk(_Walk):
             with closing(open_sqlite(self.file)) as database:
                 for number, name, kind in database.execute("SELECT id, name, type FROM topics"):
                     self.topic(number, str(name), str(kind))
-                for number in filter(self.wants, tuple(self.topics)):
+                for number in filter(self.kept.__contains__, self.topics):
                     for row, time_ns, size, start in _rows(database, number):
                         self.message(number, time_ns, None, row, size, start)
         except SQLITE_ERRORS as error:

@@ -1,14 +1,18 @@
-"""Which topics of a recording of ROS are colour, depth registered to it, and their camera."""
+"""Which topics of a recording of ROS are colour and depth that go together."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..types import FrameError, InputError, Intrinsics
-from .reading import INTRINSICS_FILE, MAX_PIXELS, read_intrinsics
+from ..types import FrameError, InputError
+from .reading import MAX_PIXELS
+from .realsense import info_of, stream_of
+from .rosframes import FIXED, LOOKED_AT, Links, fixed_motion, links_of, stream_links
 from .rosimages import GREY, ImageKind, kind_of
 from .rosmessages import CAMERA_INFO, COMPRESSED, IMAGE, Recording
 
@@ -17,10 +21,11 @@ USUAL = ("image_raw", "image_color", "image_rect_color", "image_rect", "image", 
 TRANSPORTS = ("/compressed", "/compressedDepth")
 TRIES = 5
 MOST_LISTED = 12
-LENSES = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}  # how many numbers they take, in OpenCV's order
-NO_DISTORTION: tuple[float, ...] = ()
 HOW_TO_CHOOSE = "say which with ?color=/TOPIC&depth=/TOPIC after the path"
-HOW_TO_RECORD = "record with align_depth.enable:=true (RealSense) or depth_registration:=true (others)"
+HOW_TO_RECORD = (
+    "record the camera_info of both and /tf_static as well, or registered depth: align_depth.enable:=true (RealSense), "
+    "depth_registration:=true (others)"
+)
 
 
 class Topic(NamedTuple):
@@ -35,6 +40,12 @@ class Topic(NamedTuple):
         return next((self.name[: -len(end)] for end in TRANSPORTS if self.name.endswith(end)), self.name)
 
     @property
+    def info(self) -> str:
+        """The topic of its camera."""
+        stream = stream_of(self.name)
+        return info_of(stream) if stream else f"{self.base.rpartition('/')[0]}/camera_info"
+
+    @property
     def rectified(self) -> bool:
         """Whether the distortion of its lens has been removed."""
         return "_rect" in self.base
@@ -45,23 +56,37 @@ class Topic(NamedTuple):
         return self.kind.encoding in GREY, self.base.rpartition("/")[2] not in USUAL, self.kind.packed
 
 
-def choose(recording: Recording, color: str, depth: str) -> tuple[Topic, Topic]:
-    """The topics of colour and of depth registered to it. color, depth: as the user says, or "". Raises InputError."""
+class Pair(NamedTuple):
+    """Topics that go together. depth_to_color: [4, 4] takes points in metres from the frame of depth to that of colour;
+    None where depth is registered to it."""
+
+    color: Topic
+    depth: Topic
+    depth_to_color: NDArray[np.float64] | None = None
+
+    @property
+    def apart_m(self) -> float:
+        """How far apart the two cameras are."""
+        return 0.0 if self.depth_to_color is None else float(np.linalg.norm(self.depth_to_color[:3, 3]))
+
+
+def choose(recording: Recording, color: str, depth: str) -> Pair:
+    """The topics of colour and of depth registered to it; where there are none, two whose cameras are known and joined.
+    color, depth: as the user says, or ""; both named and not joined, they are taken for registered. Raises
+    InputError."""
     topics, unreadable = _image_topics(recording)
     colors = _candidates(recording, "colour", color, [t for t in topics if t.kind.is_color], topics, unreadable)
     distances = [t for t in topics if t.kind.is_depth and (t.name == depth or not _infrared(t))]
     depths = _candidates(recording, "depth", depth, distances, topics, unreadable)
-    pairs = list(product(colors, depths))
-    if not (color and depth):
-        pairs = _registered(pairs)
-    if not pairs:
-        a, b = min(colors, key=lambda t: t.unusual), min(depths, key=lambda t: t.unusual)
-        raise InputError(
-            f"{recording.path}: depth ({b.name}, seen from {b.kind.frame or 'an unnamed frame'}) is not registered to "
-            f"colour ({a.name}, seen from {a.kind.frame or 'an unnamed frame'}): {HOW_TO_RECORD}, or where it is, "
-            f"{HOW_TO_CHOOSE}"
-        )
-    return _best(pairs, recording)
+    pairs = [Pair(*both) for both in product(colors, depths)]
+    found, why = _registered(pairs), ""
+    if not found:
+        found, why = _joined(recording, pairs)
+    if not found and color and depth:
+        found = pairs
+    if not found:
+        raise InputError(f"{recording.path}: {why}")
+    return _best(found, recording)
 
 
 def _candidates(
@@ -81,24 +106,6 @@ def _candidates(
     raise InputError(f"{recording.path}: {reason}; choose another, or record it again")
 
 
-def camera_of(recording: Recording, color: Topic, depth: Topic) -> tuple[Intrinsics, tuple[str, ...]]:
-    """The camera of the images at the size of depth, and notes. Raises InputError."""
-    folder = recording.path if recording.path.is_dir() else recording.path.parent
-    if (folder / INTRINSICS_FILE).is_file():
-        note = f"the camera is that of {INTRINSICS_FILE}, without distortion"
-        return read_intrinsics(folder / INTRINSICS_FILE, *depth.kind.size), (note,)
-    infos = recording.of_type(CAMERA_INFO)
-    wanted = [f"{topic.base.rpartition('/')[0]}/camera_info" for topic in (color, depth)]
-    name = next((each for each in wanted if each in infos), None)
-    if name is None:
-        raise InputError(
-            f"{recording.path}: no {wanted[0]} in it (sensor_msgs/CameraInfo); record it, or write the camera's 3x3 "
-            f"matrix to {folder / INTRINSICS_FILE}"
-        )
-    camera = _camera(recording.message(name, recording.places[name][0]), color, depth, f"{recording.path}: {name}")
-    return camera, () if name == wanted[0] else (f"no {wanted[0]}: the camera is that of {name}",)
-
-
 def _image_topics(recording: Recording) -> tuple[list[Topic], dict[str, str]]:
     """Those of which an image can be read, and why not of the others, by name."""
     topics, unreadable = [], {}
@@ -110,7 +117,7 @@ def _image_topics(recording: Recording) -> tuple[list[Topic], dict[str, str]]:
                 unreadable[name] = str(error).removeprefix(f"{recording.path}: ")
                 continue
             if 0 < kind.width * kind.height <= MAX_PIXELS:
-                topics.append(Topic(name, kind))
+                topics.append(Topic(name, replace(kind, frame=kind.frame or stream_of(name))))
                 unreadable.pop(name, None)
                 break
             unreadable[name] = f"{name} has images of {kind.width}x{kind.height} pixels; 1 to {MAX_PIXELS} are read"
@@ -119,56 +126,72 @@ def _image_topics(recording: Recording) -> tuple[list[Topic], dict[str, str]]:
 
 def _infrared(topic: Topic) -> bool:
     """16-bit brightness."""
-    return topic.kind.encoding == "mono16" and "depth" not in topic.name
+    return (topic.kind.encoding == "mono16" or stream_of(topic.name) != "") and "depth" not in topic.name.lower()
 
 
-def _registered(pairs: list[tuple[Topic, Topic]]) -> list[tuple[Topic, Topic]]:
+def _registered(pairs: list[Pair]) -> list[Pair]:
     """Those that one camera sees, else those where depth says so in its name."""
-    same = [(c, d) for c, d in pairs if c.kind.frame and c.kind.frame == d.kind.frame]
-    named = [(c, d) for c, d in pairs if any(word in d.name for word in REGISTERED)]
+    same = [pair for pair in pairs if pair.color.kind.frame and pair.color.kind.frame == pair.depth.kind.frame]
+    named = [pair for pair in pairs if any(word in pair.depth.name for word in REGISTERED)]
     return same or named
 
 
-def _best(pairs: list[tuple[Topic, Topic]], recording: Recording) -> tuple[Topic, Topic]:
-    def unusual(pair: tuple[Topic, Topic]) -> tuple[Any, ...]:
-        color, depth = pair
-        return color.unusual, depth.unusual, color.rectified != depth.rectified
+def _joined(recording: Recording, pairs: list[Pair]) -> tuple[list[Pair], str]:
+    """Those whose cameras are known and do not move against each other, or why the most usual is not among them. No
+    infrared takes the place of colour that there is."""
+    why = ""
+    pairs = [pair for pair in pairs if pair.color.kind.encoding not in GREY] or pairs
+    for most in (LOOKED_AT, None):  # few transforms tell of cameras that are joined, all that they are not
+        links = links_of(recording, most) | stream_links(recording)
+        found = []
+        for pair in sorted(pairs, key=_unusual, reverse=True):
+            try:
+                found.append(_join(recording, links, pair))
+            except InputError as error:
+                why = _why_not(pair, error)
+        if found:
+            break
+    return found, why
 
-    least = min(map(unusual, pairs))
-    best = [pair for pair in pairs if unusual(pair) == least]
+
+def _join(recording: Recording, links: Links, pair: Pair) -> Pair:
+    """The pair with the way from depth to colour. Raises InputError, with the reason alone."""
+    told = recording.of_type(CAMERA_INFO)
+    for topic in (pair.color,) if recording.by_hand.is_file() else (pair.color, pair.depth):
+        if topic.info not in told:
+            raise InputError(f"there is no {topic.info} in it")
+    return pair._replace(depth_to_color=fixed_motion(links, pair.depth.kind.frame, pair.color.kind.frame))
+
+
+def _why_not(pair: Pair, error: InputError) -> str:
+    color, depth = ((each.name, each.kind.frame or "an unnamed frame") for each in (pair.color, pair.depth))
+    return (
+        f"depth ({depth[0]}, seen from {depth[1]}) is not registered to colour ({color[0]}, seen from {color[1]}), and "
+        f"{error}: {HOW_TO_RECORD}; where it is registered, {HOW_TO_CHOOSE}"
+    )
+
+
+def _unusual(pair: Pair) -> tuple[Any, ...]:
+    return pair.color.unusual, pair.depth.unusual, pair.color.rectified != pair.depth.rectified
+
+
+def _best(pairs: list[Pair], recording: Recording) -> Pair:
+    """The most usual, and of several cameras those beside each other."""
+    least = min(map(_unusual, pairs))
+    usual = [pair for pair in pairs if _unusual(pair) == least]
+    best = [pair for pair in usual if pair.apart_m <= _nearest_m(pair, usual) + FIXED]
     if len(best) > 1:
-        names = sorted({topic.name for pair in best for topic in pair})
+        names = sorted({topic.name for pair in best for topic in pair[:2]})
         raise InputError(f"{recording.path}: several cameras or images: {', '.join(names)}; {HOW_TO_CHOOSE}")
     return best[0]
+
+
+def _nearest_m(pair: Pair, pairs: list[Pair]) -> float:
+    """How far apart the nearest are among those that share colour or depth with ``pair``."""
+    return min(each.apart_m for each in pairs if each.color is pair.color or each.depth is pair.depth)
 
 
 def _listed(topics: list[Topic]) -> str:
     names = [f"{topic.name} {topic.kind.encoding}" for topic in topics]
     more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
     return f"are {', '.join(names[:MOST_LISTED])}{more}" if names else "are none"
-
-
-def _camera(info: Any, color: Topic, depth: Topic, place: str) -> Intrinsics:
-    """Of what is left when the images are undistorted as ``distortion`` tells: nothing is, where they are rectified."""
-    lens, projection = (info.k, info.p) if hasattr(info, "k") else (info.K, info.P)
-    matrix = projection.reshape(3, 4) if color.rectified and np.any(projection) else lens.reshape(3, 3)
-    distortion = NO_DISTORTION if color.rectified and depth.rectified else _distortion(info, place)
-    if distortion and color.rectified != depth.rectified:
-        raise InputError(f"{place}: only one of {color.name} and {depth.name} is rectified; record both so, or neither")
-    if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
-        raise InputError(f"{place}: holds what is not a number; calibrate the camera and record it again")
-    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    width, height = (info.width, info.height) if info.width and info.height else color.kind.size
-    return Intrinsics(fx, fy, cx, cy, width, height, distortion).resized(*depth.kind.size)
-
-
-def _distortion(info: Any, place: str) -> tuple[float, ...]:
-    numbers = tuple(float(value) for value in (info.d if hasattr(info, "d") else info.D))
-    if not any(numbers):
-        return NO_DISTORTION
-    if len(numbers) not in LENSES.get(info.distortion_model, ()):
-        raise InputError(
-            f"{place}: a lens {info.distortion_model!r} with {len(numbers)} numbers, which is not corrected; record "
-            "rectified images"
-        )
-    return numbers
