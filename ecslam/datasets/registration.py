@@ -59,7 +59,7 @@ class Registration:
         depth = self._depth_lens.straight_depth(depth)[self._both]
         x, y = _projected(self._far, self._shift, np.float32(1) / np.where(depth > 0, depth, np.float32(UNKNOWN_M)))
         moved = cv2.remap(color, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(moved, np.uint8), np.where(_inside(x, y, self._seen), depth, np.float32(0))
+        return np.asarray(moved, np.uint8), depth * _inside(x, y, self._seen)
 
     @cached_property
     def _seen(self) -> Intrinsics:
