@@ -92,6 +92,11 @@ class Scene:
         return self._mesh
 
     @property
+    def surface(self) -> Mesh | None:
+        """The mesh that viewers see; None where there is none, or none is wanted."""
+        return None if self._mode == "Off" else self._mesh
+
+    @property
     def side(self) -> NDArray[np.float64]:
         """The horizontal direction [3] from what there is to see towards where it is seen best."""
         return self._back if self._best_side is None else self._best_side
