@@ -1,4 +1,4 @@
-"""Measuring on a mesh: where a ray meets it, which way is up in it, and the distance of two points. Pure numpy."""
+"""Measuring on a mesh: where a ray meets it, and how far two points are apart. Pure numpy."""
 
 from __future__ import annotations
 
@@ -11,10 +11,7 @@ from ecslam.types import Mesh
 
 Array = NDArray[np.float64]
 
-LEVEL_DEG = (40.0, 20.0, 8.0)
 TOLD_M = 0.02
-LEVEL_SHARE, NEARLY_LEVEL_DEG = 0.05, 2.0
-SAMPLE = 20_000
 LIFT_M, RING_M, RING_CORNERS = 0.012, 0.04, 12
 
 
@@ -108,29 +105,6 @@ def _across(axis: Array) -> tuple[Array, Array]:
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
     return first, np.cross(axis, first)
-
-
-def level(mesh: Mesh, guess: Array) -> Array | None:
-    """Which way is up, as unit [3], by what lies level in a mesh: floors, tables, ceilings. None with little of that.
-
-    guess: roughly up; it is kept where it is right to within two degrees.
-    """
-    faces = mesh.faces[:: max(1, len(mesh.faces) // SAMPLE)]
-    a, b, c = (mesh.vertices[faces[:, k]].astype(float) for k in range(3))
-    normals = np.cross(b - a, c - a)
-    area = np.linalg.norm(normals, axis=1)
-    up, near = guess, area > 0
-    for angle in LEVEL_DEG:
-        along = normals @ up
-        near = np.abs(along) > np.cos(np.radians(angle)) * area
-        total = (np.sign(along)[:, None] * normals)[near].sum(0)
-        length = np.linalg.norm(total)
-        if length == 0:
-            return None
-        up = total / length
-    if area[near].sum() < LEVEL_SHARE * area.sum():
-        return None
-    return guess if up @ guess > np.cos(np.radians(NEARLY_LEVEL_DEG)) else np.asarray(up)
 
 
 def in_words(m: Measurement) -> str:

@@ -7,9 +7,10 @@ import threading
 import numpy as np
 import pytest
 from ecslam_app import server
+from ecslam_app.geometry import level
 from ecslam_app.panels.measure import Panel as Measure
 from ecslam_app.panels.measure import table
-from ecslam_app.ruler import Hit, Measurement, first_hit, in_words, level
+from ecslam_app.ruler import Hit, Measurement, first_hit, in_words
 
 from ecslam import messages as m
 from ecslam.types import Mesh

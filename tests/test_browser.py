@@ -72,10 +72,15 @@ class Visit:
     def camera(self):
         return np.array(next(iter(self.dashboard.hub.viewers())).camera.position)
 
+    @property
+    def axes(self):
+        """Right, down and forward of the camera, as columns."""
+        return _rotation(next(iter(self.dashboard.hub.viewers())).camera.wxyz)
+
     def pixel(self, point):
         """Where on the page a point of the world [3] is seen."""
         client, box = next(iter(self.dashboard.hub.viewers())), self.page.locator("canvas").first.bounding_box()
-        x, y, z = np.linalg.inv(_rotation(client.camera.wxyz)) @ (point - client.camera.position)
+        x, y, z = self.axes.T @ (point - client.camera.position)
         focal = box["height"] / 2 / np.tan(client.camera.fov / 2)
         return box["x"] + box["width"] / 2 + focal * x / z, box["y"] + box["height"] / 2 + focal * y / z
 
@@ -284,6 +289,15 @@ def test_two_clicks_measure_the_room_and_dragging_still_turns_it(browser, tmp_pa
         visit.press("Clear measurements")
         visit.wait(lambda: distances.count() == 0)
         visit.wait(lambda: hue_count(visit.pixels(), 262) <= hue_count(bare, 262) + 20)
+        visit.press("Above")
+        visit.wait(lambda: visit.axes[2, 2] < -0.999)
+        visit.wait(lambda: np.abs(visit.axes[:, 0]).max() > 0.999)  # the walls stand along the edges of the page
+        visit.press("Measure")
+        page.get_by_text("click the first point").wait_for()
+        page.mouse.click(*visit.pixel([1.0, -0.8, 0.0]))
+        page.get_by_text("click the second point").wait_for()
+        page.mouse.click(*visit.pixel([1.0, 1.2, 0.0]))
+        visit.wait(lambda: distances.all_inner_texts() in (["1.99 m"], ["2.00 m"], ["2.01 m"]))
     finally:
         page.close()
         dashboard.close()

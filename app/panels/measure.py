@@ -12,9 +12,10 @@ import viser
 from numpy.typing import NDArray
 
 from .. import theme
+from ..geometry import level
 from ..hub import Hub
 from ..panel import BasePanel
-from ..ruler import Hit, Measurement, first_hit, in_words, level, metres
+from ..ruler import Hit, Measurement, first_hit, in_words, metres
 
 MOST = 5
 LINE_PX, RING_PX, LEG_PX = 4.0, 4.0, 2.0
