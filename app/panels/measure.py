@@ -19,7 +19,7 @@ from ..ruler import Hit, Measurement, first_hit, in_words, metres
 
 MOST = 5
 LINE_PX, RING_PX, LEG_PX = 4.0, 4.0, 2.0
-HOW = "Click two points on the mesh. Measure, or M, once more ends it."
+HOW = "Click two points on the mesh. Press Measure, or M, again to stop."
 FIRST, SECOND = "Measuring: click the first point on the mesh.", "Measuring: click the second point."
 
 
@@ -64,7 +64,7 @@ class Panel(BasePanel):
         gui, scene = hub.server.gui, hub.server.scene
         self._measurers: dict[int, _Measurer] = {}
         self._done: deque[Measurement] = deque(maxlen=MOST)
-        hint = "For you alone: click two points on the mesh; once more to stop. M does the same"
+        hint = "For you alone: click two points on the mesh; press again, or M, to stop"
         hub.on(gui.add_button("Measure", icon=viser.Icon.RULER_MEASURE, color="gray", hint=hint), self._toggle)
         self._html = gui.add_html("", visible=False)
         self._clear = gui.add_button("Clear measurements", icon=viser.Icon.ERASER, color="gray", visible=False)
