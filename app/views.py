@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from .geometry import behind, distance_to_path, level, overview, seen_from, square_side
+from .geometry import behind, distance_to_path, overview, seen_from, square_side
 from .scene import Scene
 
 Array = NDArray[np.float64]
@@ -102,11 +102,10 @@ class Views:
             self.show_all(client)
             return
         towards = np.array(client.camera.position) - np.array(client.camera.look_at)
-        plumb = level(mesh, scene.up)
-        up = scene.up if plumb is None else plumb
-        side = square_side(mesh, up, towards if np.linalg.norm(np.cross(up, towards)) > 0 else scene.side)
+        plumb = np.linalg.norm(np.cross(scene.up, towards)) == 0
+        side = square_side(mesh, scene.up, scene.side if plumb else towards)
         self._leave(client)
-        back = up + LEAN * side if above else side
+        back = scene.up + LEAN * side if above else side
         place = seen_from(scene.points, scene.up, back, client.camera.aspect or 1.5, STRAIGHT_FOV_RAD)
         self._fly(client, *place, GLIDE_S, STRAIGHT_FOV_RAD)
 
@@ -120,7 +119,7 @@ class Views:
         place = behind(c2w, self._scene.up)
         way = self._way(client, place[0], REMEMBERED_BEHIND)
         self._framed[client.client_id] = _Framing(*place, way, follows=True)
-        _place(client, *place)
+        self._place(client, *place)
 
     def move_along(self, c2w: Array) -> None:
         """The run's camera has moved: so do the viewers that follow it."""
@@ -162,7 +161,7 @@ class Views:
                     return
                 t = step / steps
                 ease = t * t * (3 - 2 * t)
-                _place(
+                self._place(
                     client,
                     start[0] + ease * (position - start[0]),
                     start[1] + ease * (look_at - start[1]),
@@ -172,9 +171,9 @@ class Views:
 
         asyncio.run_coroutine_threadsafe(glide(), self._server.get_event_loop())
 
-
-def _place(client: viser.ClientHandle, position: Array, look_at: Array, fov: float = FOV_RAD) -> None:
-    with client.atomic():
-        client.camera.fov = fov
-        client.camera.position = position
-        client.camera.look_at = look_at
+    def _place(self, client: viser.ClientHandle, position: Array, look_at: Array, fov: float = FOV_RAD) -> None:
+        with client.atomic():
+            client.camera.up_direction = self._scene.up
+            client.camera.fov = fov
+            client.camera.position = position
+            client.camera.look_at = look_at

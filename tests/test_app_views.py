@@ -198,3 +198,31 @@ def test_before_there_is_a_mesh_a_plan_is_the_overview(page, viewer):
     press(page, connection, "Look from", "Above")
     assert until(lambda: np.linalg.norm(client.camera.position) > 5)
     assert until(lambda: np.isclose(client.camera.fov, views.FOV_RAD))
+
+
+def test_the_page_stands_upright_once_floors_tell_how(page, viewer):
+    connection, client = viewer
+    scene, room = page.hub.scene, room_mesh()
+
+    def show(world, kept=slice(None)):
+        mesh, done = Mesh((room.vertices @ world.T).astype(np.float32), room.faces[kept]), []
+        page.hub.post(lambda: scene.show_mesh(mesh))
+        page.hub.post(page.hub.views.keep_framed)
+        page.hub.post(lambda: done.append(1))
+        assert until(lambda: done)
+
+    tilted = turn(0, 20)
+    show(tilted)
+    assert np.allclose(scene.up, tilted[:, 2], atol=1e-6)
+    assert until(lambda: np.allclose(client.camera.up_direction, scene.up)), "who is framed anew sees it upright"
+    assert np.allclose(scene.side @ scene.up, 0, atol=1e-6)
+    before = scene.up
+    show(turn(0, 21))
+    assert scene.up is before, "a little is no reason to turn everything"
+    walls = np.abs(np.cross(*np.diff(room.vertices[room.faces], axis=1).transpose(1, 0, 2))[:, 2]) < 1e-6
+    show(tilted, walls)
+    assert scene.up is before, "walls do not know better"
+    page.hub.post(lambda: scene.begin(page.engine.skip_to(3).snapshot()))
+    assert until(lambda: np.array_equal(scene.up, [0, 0, 1])), "another run, another world"
+    press(page, connection, "Reset view", True)
+    assert until(lambda: np.allclose(client.camera.up_direction, [0, 0, 1]))
