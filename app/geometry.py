@@ -11,6 +11,9 @@ from ecslam.types import Mesh
 Array = NDArray[np.float64]
 # Lower left and upper right corner of the part of the picture to fill, each axis from -1 to 1.
 _SCREEN = np.array([-0.94, -0.94]), np.array([0.94, 0.94])
+SAMPLE = 20_000  # faces that tell a mesh's directions
+LEVEL_DEG, LEVEL_SHARE, NEARLY_LEVEL_DEG = (40.0, 20.0, 8.0), 0.05, 2.0
+WALL = 0.2  # the most that a wall's normal may lean
 _PHONE = np.array([-0.94, 0.02]), np.array([0.94, 0.8])
 
 
@@ -72,13 +75,17 @@ def rotation_to(up: Array) -> Array:
 
 
 def overview(points: Array, up: Array, side: Array, aspect: float, fov_y: float) -> tuple[Array, Array]:
-    """Position and look-at point from which ``points`` [n, 3] fill the picture, seen obliquely from above.
+    """``seen_from`` for ``points`` seen obliquely from above; side: horizontal direction [3] towards the viewer."""
+    return seen_from(points, up, 0.62 * side / np.linalg.norm(side) + 0.78 * up, aspect, fov_y)
 
-    side: horizontal direction [3] from what is seen towards the viewer; aspect: width over height. On a phone (aspect
-    below 0.8) the points fill the upper part, since the controls cover the rest.
+
+def seen_from(points: Array, up: Array, back: Array, aspect: float, fov_y: float) -> tuple[Array, Array]:
+    """Position and look-at point from which ``points`` [n, 3] fill the picture.
+
+    back: direction [3] from what is seen towards the viewer, not along ``up``; aspect: width over height. On a phone
+    (aspect below 0.8) the points fill the upper part, since the controls cover the rest.
     """
-    back = 0.62 * side / np.linalg.norm(side) + 0.78 * up
-    back /= np.linalg.norm(back)
+    back = back / np.linalg.norm(back)
     right = np.cross(up, back)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), back])
@@ -109,9 +116,7 @@ def best_side(mesh: Mesh, up: Array, before: Array | None = None) -> Array:
 
     before: the direction chosen last; it stays while it is nearly as good.
     """
-    faces = mesh.faces[:: max(1, len(mesh.faces) // 20_000)]
-    a, b, c = (mesh.vertices[faces[:, k]].astype(float) for k in range(3))
-    normals = np.cross(b - a, c - a)
+    normals = _normals(mesh)
     first = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
     first /= np.linalg.norm(first)
     angles = np.radians(33.0 + 45.0 * np.arange(8))[:, None]
@@ -119,6 +124,48 @@ def best_side(mesh: Mesh, up: Array, before: Array | None = None) -> Array:
     sides = sides if before is None else np.concatenate([before[None], sides])
     area = (normals @ (0.62 * sides + 0.78 * up).T).clip(0).sum(0)
     return np.asarray(sides[0] if before is not None and area[0] > 0.75 * area.max() else sides[np.argmax(area)])
+
+
+def level(mesh: Mesh, guess: Array) -> Array | None:
+    """Which way is up, as unit [3], by what lies level in a mesh: floors, tables, ceilings. None with little of that.
+
+    guess: roughly up; it is kept where it is right to within two degrees.
+    """
+    normals = _normals(mesh)
+    area = np.linalg.norm(normals, axis=1)
+    up, near = guess, area > 0
+    for angle in LEVEL_DEG:
+        along = normals @ up
+        near = np.abs(along) > np.cos(np.radians(angle)) * area
+        total = (np.sign(along)[:, None] * normals)[near].sum(0)
+        length = np.linalg.norm(total)
+        if length == 0:
+            return None
+        up = total / length
+    if area[near].sum() < LEVEL_SHARE * area.sum():
+        return None
+    return guess if up @ guess > np.cos(np.radians(NEARLY_LEVEL_DEG)) else np.asarray(up)
+
+
+def square_side(mesh: Mesh, up: Array, towards: Array) -> Array:
+    """The horizontal direction [3] nearest to ``towards`` [3] that is square to most of a mesh's walls."""
+    first = towards - (towards @ up) * up
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    normals = _normals(mesh)
+    area = np.linalg.norm(normals, axis=1)
+    walls = np.abs(normals @ up) < WALL * area
+    # Walls that face each other, or meet in a corner, agree once their angles are taken four times.
+    angles = np.arctan2(normals[walls] @ second, normals[walls] @ first)
+    turn = np.angle(area[walls] @ np.exp(4j * angles)) / 4
+    return np.asarray(np.cos(turn) * first + np.sin(turn) * second)
+
+
+def _normals(mesh: Mesh) -> Array:
+    """Normals [n, 3] of a sample of a mesh's faces, twice as long as each is large."""
+    faces = mesh.faces[:: max(1, len(mesh.faces) // SAMPLE)]
+    a, b, c = (mesh.vertices[faces[:, k]].astype(float) for k in range(3))
+    return np.cross(b - a, c - a)
 
 
 def distance_to_path(point: Array, path: Array) -> float:

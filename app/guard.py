@@ -95,6 +95,22 @@ def _click(m: Mapping[str, Any], _: Values) -> bool:
     )
 
 
+def _pointer(m: Mapping[str, Any], _: Values) -> bool:
+    """A click anywhere in the scene: no rectangle, no modifier, and a ray of unit direction."""
+    points = m.get("screen_pos")
+    return (
+        set(m) == {"event_type", "ray_origin", "ray_direction", "screen_pos", "modifier"}
+        and m["event_type"] == "click"
+        and m["modifier"] is None
+        and _vector(m["ray_origin"], 3)
+        and _vector(m["ray_direction"], 3)
+        and abs(math.hypot(*m["ray_direction"]) - 1) < 1e-3
+        and isinstance(points, list)
+        and len(points) == 1
+        and _vector(points[0], 2)
+    )
+
+
 def _command(m: Mapping[str, Any], _: Values) -> bool:
     return set(m) == {"uuid"} and isinstance(m["uuid"], str)
 
@@ -113,6 +129,7 @@ _CHECKS: dict[str, Callable[[Mapping[str, Any], Values], bool]] = {
     "GuiUpdateMessage": _gui_update,
     "ViewerCameraMessage": _camera,
     "SceneNodeClickMessage": _click,
+    "ScenePointerMessage": _pointer,
     "CommandTriggerMessage": _command,
     "GetRenderResponseMessage": _render,
     "FileTransferPartAck": _acknowledge,

@@ -247,6 +247,8 @@ class Hub:
             self.history = history_of(frame_rows(self.engine.run_folder))
         self.scene.begin(s)
         self.views.begin()
+        for panel in self.panels:
+            panel.begin()
 
     def _tell(self, message: Event | Ack) -> None:
         if isinstance(message, Ack):
@@ -316,6 +318,8 @@ class Hub:
 
     def _visit(self, client: viser.ClientHandle, index: int) -> None:
         if self.current is None or index >= len(self.current.keyframes):
+            return
+        if any(panel.takes_clicks(client) for panel in self.panels):
             return
         keyframe = self.current.keyframes[index]
         self.views.visit(client, keyframe.c2w)

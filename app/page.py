@@ -30,6 +30,12 @@ _FOCUS = (
     "addEventListener('click',e=>{if(e.detail&&e.target.closest('button'))document.activeElement.blur()});"
     "addEventListener('keydown',e=>{if(e.key===' '&&e.target.closest('button'))e.stopPropagation()},true)"
 )
+# A finger captures the canvas by itself when it touches it, which viser takes for a gizmo being dragged: a tap would be
+# no click.
+_TAP = (
+    "addEventListener('pointerdown',e=>{if(e.pointerType==='touch'&&e.target.tagName==='CANVAS'&&"
+    "e.target.hasPointerCapture(e.pointerId))e.target.releasePointerCapture(e.pointerId)},true)"
+)
 # viser's page tries its socket anew every second while the server is away. After some failures a browser holds each
 # try back for longer than that, and the page never returns: let one through only when the server answers, and wait.
 _RETURN = (
@@ -45,7 +51,7 @@ def _page() -> tuple[bytes, bytes]:
     text = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text("utf-8")
     head = (
         f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style>'
-        f"<script>{_FOCUS};{_RETURN}</script></head>"
+        f"<script>{_FOCUS};{_TAP};{_RETURN}</script></head>"
     )
     body = text.replace("<title>Viser</title>", "").replace("</head>", head, 1).encode()
     return body, gzip.compress(body)

@@ -6,6 +6,8 @@ import importlib
 import pkgutil
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import viser
+
 from ecslam.messages import Ack, Event, KeyframeView, Snapshot
 
 from . import panels
@@ -48,6 +50,13 @@ class BasePanel:
 
     def keyframe(self, keyframe: KeyframeView) -> None:
         """A viewer has clicked a keyframe's frustum."""
+
+    def begin(self) -> None:
+        """Another run begins, in a world of its own."""
+
+    def takes_clicks(self, client: viser.ClientHandle) -> bool:
+        """Whether a viewer's clicks are for this panel, so that none of them flies to a keyframe."""
+        return False
 
 
 def put(control: Any, value: Any) -> None:

@@ -30,7 +30,7 @@ def html_replay(s: Snapshot, mesh: Mesh | None, history: History, dark: bool) ->
             scene.set_mesh(MeshReady(s.frame, 0.0, mesh))
         position, look_at = overview(scene.points, scene.up, scene.side, 1.5, FOV_RAD)
         server.initial_camera.position, server.initial_camera.look_at = tuple(position), tuple(look_at)
-        server.initial_camera.fov = FOV_RAD
+        server.initial_camera.up, server.initial_camera.fov = tuple(scene.up), FOV_RAD
         serializer = server.get_scene_serializer()
         for count in np.unique(np.linspace(1, len(s.trajectory), min(STEPS, len(s.trajectory))).astype(int)):
             scene.update(_until(s, int(count), history))

@@ -18,10 +18,12 @@ from ecslam.types import Mesh
 from . import theme
 from .geometry import (
     FRUSTUM_FACES,
+    NEARLY_LEVEL_DEG,
     best_side,
     first_side,
     frustum_corners,
     frustum_lines,
+    level,
     polyline,
     rotation_to,
     up_direction,
@@ -39,7 +41,7 @@ _NO_LINES = np.zeros((0, 2, 3), np.float32)
 class Scene:
     """Draws snapshots on a viser server. ``on_keyframe(client, index)`` is called when a frustum is clicked.
 
-    points: [n, 3] metres, a sample of what there is to see.
+    points: [n, 3] metres, a sample of what there is to see; up: [3] unit.
     """
 
     def __init__(self, server: viser.ViserServer, on_keyframe: Callable[[Any, int], None] | None = None) -> None:
@@ -56,6 +58,7 @@ class Scene:
         self._walked = np.zeros((1, 3))
         self.points = np.array([[-1.0, -1, -1], [1, 1, 1]])
         self.up, self._back = np.array([0.0, 0.0, 1.0]), np.array([0.8, -0.6, 0.0])
+        self._guessed_up = self.up
         self._best_side: NDArray[np.float64] | None = None
         server.scene.configure_default_lights(cast_shadow=False)
         self._grid = server.scene.add_grid(
@@ -92,6 +95,11 @@ class Scene:
         return self._mesh
 
     @property
+    def surface(self) -> Mesh | None:
+        """The mesh that viewers see; None where there is none, or none is wanted."""
+        return None if self._mode == "Off" else self._mesh
+
+    @property
     def side(self) -> NDArray[np.float64]:
         """The horizontal direction [3] from what there is to see towards where it is seen best."""
         return self._back if self._best_side is None else self._best_side
@@ -101,7 +109,7 @@ class Scene:
     def begin(self, s: Snapshot) -> None:
         """Take the up direction from a run's first snapshot, and forget the last run."""
         poses = s.trajectory if s.trajectory_gt is None else s.trajectory_gt
-        self.up = up_direction(poses)
+        self.up = self._guessed_up = up_direction(poses)
         self._inspected, self._mesh = None, None
         self._lines["trajectory/before the loop"].points = _NO_LINES
         self._server.scene.set_up_direction(tuple(self.up))
@@ -135,12 +143,20 @@ class Scene:
     def show_mesh(self, mesh: Mesh) -> None:
         """Put ``mesh`` in the place of the one on show."""
         self._mesh = simplify(mesh)
+        self._stand_upright(self._mesh)
         self._best_side = best_side(self._mesh, self.up, self._best_side)
         low, high = np.percentile(self._mesh.vertices, (1, 99), axis=0)
         some = self._mesh.vertices[:: max(1, len(self._mesh.vertices) // SAMPLE)].astype(float)
         self.points = np.concatenate([some.clip(low, high), self._walked])
         self._grid.position = (low + high) / 2 + (float(((some - (low + high) / 2) @ self.up).min()) - 0.02) * self.up
         self._draw_mesh()
+
+    def _stand_upright(self, mesh: Mesh) -> None:
+        """Cameras that look down take up for where they came from; floors and tables know better."""
+        found = level(mesh, self._guessed_up)
+        if found is not None and found @ self.up < np.cos(np.radians(NEARLY_LEVEL_DEG)):
+            self.up, self._best_side = found, None
+            self._grid.wxyz = rotation_to(self.up)
 
     def compare(self, centres: NDArray[np.float64]) -> None:
         """Draw another run's camera centres [n, 3] beside this one's."""

@@ -14,6 +14,7 @@ WINDOW: RGB = (217, 70, 239)
 LOOP: RGB = (16, 185, 129)
 BEFORE: RGB = (239, 68, 68)
 OTHER: RGB = (20, 184, 166)
+MEASURE: RGB = (124, 58, 237)
 ACCENT: RGB = (234, 88, 12)
 GRID: tuple[RGB, RGB] = (214, 220, 228), (58, 64, 74)  # light, dark
 

@@ -9,12 +9,14 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from .geometry import behind, distance_to_path, overview
+from .geometry import behind, distance_to_path, overview, seen_from, square_side
 from .scene import Scene
 
 Array = NDArray[np.float64]
 
 FOV_RAD = np.radians(50.0)
+STRAIGHT_FOV_RAD = np.radians(8.0)  # seen from far away, what is parallel stays so
+LEAN = 0.002  # off the plumb line, where a camera would not know how to turn
 GLIDE_S, GLIDE_STEPS_PER_S = 0.6, 30
 GLIDERS = 4  # with more viewers each one's camera jumps: thirty messages a second to each would cost the engine
 MOVED, WORTH_A_MOVE = 0.02, 0.12
@@ -93,6 +95,20 @@ class Views:
         self._leave(client)
         self._fly(client, *self._overview(points, client.camera.aspect), GLIDE_S)
 
+    def straight(self, client: viser.ClientHandle, above: bool) -> None:
+        """Show one viewer everything as a drawing does: from above, or from the side, square to the nearest walls."""
+        scene, mesh = self._scene, self._scene.mesh
+        if mesh is None:
+            self.show_all(client)
+            return
+        towards = np.array(client.camera.position) - np.array(client.camera.look_at)
+        plumb = np.linalg.norm(np.cross(scene.up, towards)) == 0
+        side = square_side(mesh, scene.up, scene.side if plumb else towards)
+        self._leave(client)
+        back = scene.up + LEAN * side if above else side
+        place = seen_from(scene.points, scene.up, back, client.camera.aspect or 1.5, STRAIGHT_FOV_RAD)
+        self._fly(client, *place, GLIDE_S, STRAIGHT_FOV_RAD)
+
     def visit(self, client: viser.ClientHandle, c2w: Array) -> None:
         """Fly one viewer to just behind a keyframe."""
         self._leave(client)
@@ -103,7 +119,7 @@ class Views:
         place = behind(c2w, self._scene.up)
         way = self._way(client, place[0], REMEMBERED_BEHIND)
         self._framed[client.client_id] = _Framing(*place, way, follows=True)
-        _place(client, *place)
+        self._place(client, *place)
 
     def move_along(self, c2w: Array) -> None:
         """The run's camera has moved: so do the viewers that follow it."""
@@ -133,8 +149,10 @@ class Views:
     def _overview(self, points: Array, aspect: float) -> tuple[Array, Array]:
         return overview(points, self._scene.up, self._scene.side, aspect or 1.5, FOV_RAD)
 
-    def _fly(self, client: viser.ClientHandle, position: Array, look_at: Array, seconds: float) -> None:
-        start = np.array(client.camera.position), np.array(client.camera.look_at)
+    def _fly(
+        self, client: viser.ClientHandle, position: Array, look_at: Array, seconds: float, fov: float = FOV_RAD
+    ) -> None:
+        start = np.array(client.camera.position), np.array(client.camera.look_at), client.camera.fov
 
         async def glide() -> None:
             steps = max(1, int(GLIDE_STEPS_PER_S * seconds))
@@ -143,13 +161,19 @@ class Views:
                     return
                 t = step / steps
                 ease = t * t * (3 - 2 * t)
-                _place(client, start[0] + ease * (position - start[0]), start[1] + ease * (look_at - start[1]))
+                self._place(
+                    client,
+                    start[0] + ease * (position - start[0]),
+                    start[1] + ease * (look_at - start[1]),
+                    start[2] + ease * (fov - start[2]),
+                )
                 await asyncio.sleep(1 / GLIDE_STEPS_PER_S)
 
         asyncio.run_coroutine_threadsafe(glide(), self._server.get_event_loop())
 
-
-def _place(client: viser.ClientHandle, position: Array, look_at: Array) -> None:
-    with client.atomic():
-        client.camera.position = position
-        client.camera.look_at = look_at
+    def _place(self, client: viser.ClientHandle, position: Array, look_at: Array, fov: float = FOV_RAD) -> None:
+        with client.atomic():
+            client.camera.up_direction = self._scene.up
+            client.camera.fov = fov
+            client.camera.position = position
+            client.camera.look_at = look_at

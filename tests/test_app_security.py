@@ -61,6 +61,7 @@ def dial(page, origin="own", **headers):
         subprotocols=[f"viser-v{viser.__version__}"],
         additional_headers=headers,
         max_size=None,
+        max_queue=None,  # who reads nothing can hang up all the same
         compression=None,
     )
 
@@ -72,6 +73,11 @@ def say(client, kind, **fields):
 CAMERA = {
     "wxyz": [1.0, 0, 0, 0], "position": [3.0, 3, 3], "look_at": [0.0, 0, 0], "up_direction": [0.0, 0, 1],
     "fov": 1.2, "near": 0.01, "far": 1000.0, "image_height": 600, "image_width": 800,
+}  # fmt: skip
+
+CLICK = {
+    "event_type": "click", "ray_origin": [0.0, 0, 10], "ray_direction": [0.0, 0, -1], "screen_pos": [[0.5, 0.5]],
+    "modifier": None,
 }  # fmt: skip
 
 
@@ -237,7 +243,11 @@ def test_uploads_do_not_pile_up(open_page, engine):
     [b"", b"\xff" * 50, b"\x91" * 5000, msgspec.msgpack.encode(7), msgspec.msgpack.encode({"type": ["x"]}),
      msgspec.msgpack.encode({"type": "RunJavascriptMessage", "source": "alert(1)"}),
      msgspec.msgpack.encode({"type": "ViewerCameraMessage", **CAMERA, "position": [float("nan"), 0, 0]}),
-     msgspec.msgpack.encode({"type": "ViewerCameraMessage", **CAMERA, "extra": 1})],
+     msgspec.msgpack.encode({"type": "ViewerCameraMessage", **CAMERA, "extra": 1}),
+     *(msgspec.msgpack.encode({"type": "ScenePointerMessage", **CLICK, **wrong}) for wrong in (
+         {"ray_direction": [0.0, 0, 0]}, {"ray_direction": [0.0, 0, -2.0]}, {"ray_direction": None},
+         {"ray_origin": [0.0, 0, float("nan")]}, {"ray_origin": [0.0, 0]}, {"screen_pos": []},
+         {"screen_pos": [0.5, 0.5]}, {"modifier": "shift"}, {"event_type": "rect-select"}, {"extra": 1}))],
 )  # fmt: skip
 def test_malformed_messages_are_dropped(raw):
     assert not guard.message_passes(raw, lambda uuid, value: True)

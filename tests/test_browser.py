@@ -72,6 +72,27 @@ class Visit:
     def camera(self):
         return np.array(next(iter(self.dashboard.hub.viewers())).camera.position)
 
+    @property
+    def axes(self):
+        """Right, down and forward of the camera, as columns."""
+        return _rotation(next(iter(self.dashboard.hub.viewers())).camera.wxyz)
+
+    def pixel(self, point):
+        """Where on the page a point of the world [3] is seen."""
+        client, box = next(iter(self.dashboard.hub.viewers())), self.page.locator("canvas").first.bounding_box()
+        x, y, z = self.axes.T @ (point - client.camera.position)
+        focal = box["height"] / 2 / np.tan(client.camera.fov / 2)
+        return box["x"] + box["width"] / 2 + focal * x / z, box["y"] + box["height"] / 2 + focal * y / z
+
+    def finger(self, *path):
+        """Touch the page, move along the path, and let go."""
+        touch = self.page.context.new_cdp_session(self.page)
+        for k, (x, y) in enumerate(path):
+            kind = "touchMove" if k else "touchStart"
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": y}]})
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        touch.detach()
+
     def press(self, name):
         self.page.get_by_role("button", name=name, exact=True).click()
 
@@ -229,21 +250,58 @@ def test_click_on_a_keyframe_flies_there(live):
     engine, visit = live
     visit.tab("Pictures")
     visit.page.wait_for_timeout(800)
-    client = next(iter(visit.dashboard.hub.viewers()))
-    before, box = visit.camera, visit.page.locator("canvas").first.bounding_box()
-    rotation = np.linalg.inv(_rotation(client.camera.wxyz))
+    before = visit.camera
     for keyframe in engine.latest().keyframes[3:8]:
-        middle = keyframe.c2w[:3, 3] + 0.09 * keyframe.c2w[:3, 2]
-        x, y, z = rotation @ (middle - client.camera.position)
-        focal = box["height"] / 2 / np.tan(client.camera.fov / 2)
-        visit.page.mouse.click(
-            box["x"] + box["width"] / 2 + focal * x / z, box["y"] + box["height"] / 2 + focal * y / z
-        )
+        visit.page.mouse.click(*visit.pixel(keyframe.c2w[:3, 3] + 0.09 * keyframe.c2w[:3, 2]))
         visit.page.wait_for_timeout(1200)
         if np.linalg.norm(visit.camera - before) > 0.5:
             break
     assert np.linalg.norm(visit.camera - before) > 0.5
     assert visit.page.get_by_text(re.compile(r"^Keyframe \d+$")).count() == 1
+
+
+def test_two_clicks_measure_the_room_and_dragging_still_turns_it(browser, tmp_path):
+    dashboard = server.view([write_run(tmp_path / "run", 30)], port=0)
+    visit = Visit(browser, dashboard)
+    page, distances = visit.page, visit.page.locator(".ec td:first-child:visible")
+    try:
+        visit.tab("View")
+        visit.press("Measure")
+        page.get_by_text("click the first point").wait_for()
+        bare, before = visit.pixels(), visit.camera
+        visit.tick("Keyframes")
+        page.mouse.click(*visit.pixel([1.0, -0.8, 0.0]))
+        page.get_by_text("click the second point").wait_for()
+        page.mouse.click(*visit.pixel([1.0, 1.2, 0.0]))
+        visit.wait(lambda: distances.all_inner_texts() in (["1.99 m"], ["2.00 m"], ["2.01 m"]))
+        visit.wait(lambda: hue_count(visit.pixels(), 262) > hue_count(bare, 262) + 100)
+        assert np.allclose(visit.camera, before)
+        page.mouse.move(300, 300)
+        page.mouse.down()
+        page.mouse.move(360, 300, steps=4)
+        page.mouse.up()
+        visit.wait(lambda: np.linalg.norm(visit.camera - before) > 0.3)
+        page.get_by_text("click the first point").wait_for()
+        page.mouse.click(8, 632)
+        page.get_by_text("There is no surface where you clicked").wait_for()
+        page.keyboard.press("m")
+        visit.wait(lambda: page.get_by_text("click the first point").count() == 0)
+        visit.press("Clear measurements")
+        visit.wait(lambda: distances.count() == 0)
+        visit.wait(lambda: hue_count(visit.pixels(), 262) <= hue_count(bare, 262) + 20)
+        visit.press("Above")
+        visit.wait(lambda: visit.axes[2, 2] < -0.999)
+        visit.wait(lambda: np.abs(visit.axes[:, 0]).max() > 0.999)  # the walls stand along the edges of the page
+        visit.press("Measure")
+        page.get_by_text("click the first point").wait_for()
+        page.mouse.click(*visit.pixel([1.0, -0.8, 0.0]))
+        page.get_by_text("click the second point").wait_for()
+        page.mouse.click(*visit.pixel([1.0, 1.2, 0.0]))
+        visit.wait(lambda: distances.all_inner_texts() in (["1.99 m"], ["2.00 m"], ["2.01 m"]))
+    finally:
+        page.close()
+        dashboard.close()
+    assert visit.errors == []
 
 
 def _rotation(wxyz):
@@ -324,6 +382,18 @@ def test_usable_on_a_phone(tmp_path, browser):
         assert card["width"] > 340
         assert card["height"] < 240, "it leaves room for the controls"
         assert visit.page.evaluate(CONTRAST) > 4.5
+        visit.tab("View")
+        visit.press("Measure")
+        visit.page.get_by_text("click the first point").wait_for()
+        before, mesh = visit.camera, dashboard.hub.scene.mesh
+        a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(float) for k in range(3))
+        front = (np.cross(b - a, c - a) * (before - a)).sum(1) > 0
+        seen = [(x, y) for x, y in map(visit.pixel, a[front][::20]) if 40 < x < 350 and 120 < y < 340]
+        visit.finger(seen[len(seen) // 2])
+        visit.wait(lambda: visit.page.get_by_text("click the second point").count() == 1, 40)
+        visit.finger((100, 200), (130, 205), (160, 210), (190, 215), (190, 500))
+        visit.wait(lambda: np.linalg.norm(visit.camera - before) > 0.3)
+        assert visit.page.get_by_text("click the second point").count() == 1, "turning the view is no tap"
     finally:
         visit.page.close()
         dashboard.close()

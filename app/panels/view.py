@@ -48,6 +48,12 @@ class Panel(BasePanel):
             "Reset view", icon=viser.Icon.FOCUS_CENTERED, color="gray", hint="For you alone: everything in sight"
         )
         hub.on(reset, lambda event: hub.views.show_all(event.client))
+        straight = gui.add_button_group(
+            "Look from",
+            ("Above", "The side"),
+            hint="For you alone: a floor plan, or square to the walls; the grid's lines are half a metre apart",
+        )
+        hub.on(straight, lambda event: hub.views.straight(event.client, straight.value == "Above"))
 
     def _set_layer(self, group: str, event: Any) -> None:
         self.hub.scene.set_visible(group, bool(event.target.value))
