@@ -21,6 +21,7 @@ from .config import Config
 from .field import TsdfField, create_field
 from .following import Follower
 from .indices import evenly
+from .kernels.denormals import flushed
 from .kernels.graphs import Recorder
 from .keyframes import Keyframe, Shelf, make_keyframe, surface_points
 from .loops import LoopDetector, loop_event
@@ -95,6 +96,7 @@ class Slam:
 
     # ---- one frame --------------------------------------------------------------------------------------------------
 
+    @flushed()
     def step(self, frame: Frame, interrupt: Interrupt | None = None) -> StepReport:
         """Track the frame; every n-th frame, map. Raises whatever ``interrupt`` raises, called inside long loops."""
         if self.mapper is None:
@@ -166,6 +168,7 @@ class Slam:
             map_ms=1e3 * (time.perf_counter() - started),
         )
 
+    @flushed()
     def finish(self, interrupt: Interrupt | None = None) -> None:
         """The last mapping, with the smoothness term (paper: "at the last image frame"), then the map alone on all
         keyframes (ours); call it once, at the end. Raises whatever ``interrupt`` raises; no pose has moved then, or
@@ -326,6 +329,7 @@ class Slam:
         }
 
     @classmethod
+    @flushed()
     def restore(
         cls, config: Config, intrinsics: Intrinsics, state: Arrays, *, device: torch.device | None = None
     ) -> Slam:

@@ -37,6 +37,7 @@ from ._cpu_work import (
     table_worker,
     values_worker,
 )
+from .denormals import flushed
 from .depths_cpu import importance_depths as importance_depths
 from .depths_cpu import sample_depths as sample_depths
 from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, PoseMoments, RayBatch, StepResult, Weights
@@ -110,7 +111,7 @@ def _net(layout: GridLayout, params: FieldParams) -> Net:
 
 @cache
 def _helpers(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads - 1, "ecslam-kernels")
+    return ThreadPoolExecutor(threads - 1, "ecslam-kernels", torch.set_flush_denormal, (True,))
 
 
 def _spread(threads: int, worker: Callable[..., None], *args: Any) -> None:
@@ -121,7 +122,8 @@ def _spread(threads: int, worker: Callable[..., None], *args: Any) -> None:
     counter = np.zeros(1, np.int64)
     others = [_helpers(threads).submit(worker, t, counter, *args) for t in range(1, threads)]
     try:
-        worker(0, counter, *args)
+        with flushed():
+            worker(0, counter, *args)
     finally:
         wait([other for other in others if not other.cancel()])
     for other in others:
