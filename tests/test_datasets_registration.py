@@ -38,6 +38,16 @@ def test_each_pixel_has_the_colour_of_the_point_that_it_measured(
     assert np.abs(cv2.resize(stored, (64, 48)).astype(int) - paint(seen(DEPTH, np.eye(4), wall_m)[0])).max() > 10
 
 
+def test_a_part_that_is_deeper_for_colour_everywhere_is_projected_too() -> None:
+    """The optical axis, where it would not be, is cut off, for colour does not see it."""
+    move, color_camera = motion((0, -6.0, 0)), Intrinsics(60.0, 60.0, -12.0, 23.5, 64, 48)
+    pair = Registration(replace(DEPTH, cx=0.0), color_camera, move)
+    assert pair.camera.cx < -2
+    points, _ = seen(color_camera, np.linalg.inv(move), 2.0)
+    moved, _ = pair.registered(paint(points), np.full((48, 64), 2.0, np.float32))
+    assert np.abs(moved.astype(int) - paint(seen(pair.camera, np.eye(4), 2.0)[0])).max() <= 2
+
+
 def test_what_is_near_moves_farther_than_what_is_behind_it() -> None:
     move = motion(move=(-0.1, 0, 0))
     color, far = images(WIDE, move, 2.0)
@@ -164,6 +174,8 @@ def test_two_files_tell_of_a_camera_of_ones_own(tmp_path: Path) -> None:
         (lambda f: np.savetxt(f / "depth-to-color.txt", np.eye(3)), "not a rigid motion"),
         (lambda f: np.savetxt(f / "depth-to-color.txt", motion(move=(25.0, 0, 0))), "in metres"),
         (lambda f: np.savetxt(f / "color-intrinsics.txt", np.eye(2)), "calibration matrix"),
+        (lambda f: np.savetxt(f / "color-intrinsics.txt", np.diag([0, 0, 1])), "color-intrinsics.txt: focal lengths 0"),
+        (lambda f: np.savetxt(f / "camera-intrinsics.txt", np.diag([0, 0, 1])), ": depth: focal lengths 0 and 0"),
     ],
 )
 def test_what_cannot_be_used_is_said(tmp_path: Path, spoil: object, words: str) -> None:

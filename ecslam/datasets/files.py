@@ -24,9 +24,9 @@ class FileSequence:
 
     intrinsics: of the depth images; their distortion is removed from both images on reading. color_size: (width,
     height) of the colour files, which are resized where it differs. registration: where colour is to be moved to depth;
-    intrinsics are then its ``camera``. depth_scale: stored units per metre. times: [N]
-    seconds. poses: [N, 4, 4] camera-to-world, NaN where a frame has none, or None. notes: what opening it brought to
-    light, one sentence each. Raises InputError when these do not belong together.
+    intrinsics are then its ``camera``. depth_scale: stored units per metre. times: [N] seconds. poses: [N, 4, 4]
+    camera-to-world, NaN where a frame has none, or None. notes: what opening it brought to light, one sentence each.
+    Raises InputError when these do not belong together.
     """
 
     name: str

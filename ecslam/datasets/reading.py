@@ -122,12 +122,23 @@ def common_size(files: list[Path], samples: int = 9) -> tuple[int, int]:
 def same_size(color_files: list[Path], depth_files: list[Path]) -> tuple[int, int]:
     """The size that colour and depth share. Raises InputError when they do not."""
     color, depth = common_size(color_files), common_size(depth_files)
+    require_same_size(color, depth, color_files[0].parent)
+    return depth
+
+
+def require_same_size(color: tuple[int, int], depth: tuple[int, int], folder: Path) -> None:
+    """Raises InputError when colour and depth in ``folder`` differ in (width, height)."""
     if color != depth:
         raise InputError(
-            f"{color_files[0].parent}: colour images are {color[0]}x{color[1]} but depth images {depth[0]}x{depth[1]}; "
+            f"{folder}: colour images are {color[0]}x{color[1]} but depth images {depth[0]}x{depth[1]}; "
             "this layout has both at one size, pixel on pixel: export them again, registered"
         )
-    return depth
+
+
+def require_focal_lengths(camera: Intrinsics, place: Path | str) -> None:
+    """Raises InputError when no lens has those of ``camera``, which ``place`` tells."""
+    if not (camera.fx > 0 and camera.fy > 0):
+        raise InputError(f"{place}: focal lengths {camera.fx:g} and {camera.fy:g}; calibrate the camera")
 
 
 def find_registration(folder: Path, depth: Intrinsics, color_size: tuple[int, int]) -> Registration | None:
@@ -145,8 +156,11 @@ def find_registration(folder: Path, depth: Intrinsics, color_size: tuple[int, in
         raise InputError(
             f"{motion}: not a rigid motion as a 4x4 matrix, from depth's camera to that of colour, in metres"
         )
+    color = read_intrinsics(matrix, *color_size)
+    require_focal_lengths(depth, f"{folder}: depth")
+    require_focal_lengths(color, matrix)
     try:
-        return Registration(depth, read_intrinsics(matrix, *color_size), moves[0])
+        return Registration(depth, color, moves[0])
     except InputError as error:
         raise InputError(f"{motion}: {error}") from None
 

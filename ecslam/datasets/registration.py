@@ -57,7 +57,8 @@ class Registration:
         if self._seen.width != color.shape[1]:
             color = shrunk(color, (self._seen.width, self._seen.height))
         depth = self._depth_lens.straight_depth(depth)[self._both]
-        x, y = _projected(self._far, self._shift, np.float32(1) / np.where(depth > 0, depth, np.float32(UNKNOWN_M)))
+        inverse = np.float32(1) / np.where(depth > 0, depth, np.float32(UNKNOWN_M))
+        x, y = _projected(self._far[:, self._both[0], self._both[1]], self._shift, inverse)
         moved = cv2.remap(color, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(moved, np.uint8), depth * _inside(x, y, self._seen)
 
@@ -71,26 +72,21 @@ class Registration:
 
     @cached_property
     def _far(self) -> NDArray[np.float32]:
-        """[3, H, W] where colour sees what each pixel of ``camera`` looks at, were it infinitely far (homogeneous)."""
-        return np.ascontiguousarray(self._whole[:, self._both[0], self._both[1]])
+        """[3, H, W] where colour sees what each pixel of depth looks at, were it infinitely far (homogeneous)."""
+        v, u = np.mgrid[: self.depth.height, : self.depth.width]
+        through = self._seen.matrix() @ self.depth_to_color[:3, :3] @ np.linalg.inv(self.depth.matrix())
+        return np.einsum("ij,jhw->ihw", through, np.stack([u, v, np.ones_like(u)])).astype(np.float32)
 
     @cached_property
     def _shift(self) -> NDArray[np.float32]:
         """[3] by how much that moves, times the inverse of the depth."""
         return (self._seen.matrix() @ self.depth_to_color[:3, 3]).astype(np.float32)
 
-    @property
-    def _whole(self) -> NDArray[np.float32]:
-        """``_far`` of the whole image of depth."""
-        v, u = np.mgrid[: self.depth.height, : self.depth.width]
-        through = self._seen.matrix() @ self.depth_to_color[:3, :3] @ np.linalg.inv(self.depth.matrix())
-        return np.einsum("ij,jhw->ihw", through, np.stack([u, v, np.ones_like(u)])).astype(np.float32)
-
     @cached_property
     def _both(self) -> tuple[slice, slice]:
         """Rows and columns of depth that colour sees, too, as long as they are ``SEEN_FROM_M`` away or farther."""
-        whole = self._whole
-        ends = (_projected(whole, self._shift, np.full_like(whole[0], inverse)) for inverse in (1 / SEEN_FROM_M, 0.0))
+        inverses = (np.full_like(self._far[0], inverse) for inverse in (1 / SEEN_FROM_M, 0.0))
+        ends = (_projected(self._far, self._shift, inverse) for inverse in inverses)
         near, far = (_inside(x, y, self._seen) for x, y in ends)
         return _all_true(near & far)
 
@@ -110,7 +106,7 @@ def _projected(
     x, y = shift[0] * inverse, shift[1] * inverse
     x += far[0]
     y += far[1]
-    if shift[2] or far[2].min() < 1:  # else the two look the same way
+    if shift[2] or (far[2] != 1).any():  # else the two look the same way
         z = far[2] + shift[2] * inverse
         z[z <= 0] = np.nan
         x /= z

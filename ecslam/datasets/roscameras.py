@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import InputError, Intrinsics
-from .reading import INTRINSICS_FILE, read_intrinsics, same_shape
+from .reading import INTRINSICS_FILE, read_intrinsics, require_focal_lengths, same_shape
 from .realsense import NUMBER, measures, stream_of
 from .registration import Registration
 from .rosmessages import CAMERA_INFO, Recording
@@ -81,10 +81,7 @@ def _apart(recording: Recording, pair: Pair, depth_to_color: NDArray[np.float64]
     depth = read_intrinsics(recording.by_hand, *size) if by_hand else _own(recording, pair.depth)
     color = _own(recording, pair.color)
     for camera, place in ((depth, INTRINSICS_FILE if by_hand else pair.depth.info), (color, pair.color.info)):
-        if not (camera.fx > 0 and camera.fy > 0):
-            raise InputError(
-                f"{recording.path}: {place}: focal lengths {camera.fx:g} and {camera.fy:g}; calibrate the camera"
-            )
+        require_focal_lengths(camera, f"{recording.path}: {place}")
     try:
         registration = Registration(depth, color, depth_to_color)
     except InputError as error:

@@ -23,7 +23,7 @@ from .reading import (
     paired,
     read_pose_files,
     read_text,
-    same_size,
+    require_same_size,
 )
 from .registration import Registration
 
@@ -51,11 +51,11 @@ def open(path: Path) -> FileSequence:
     depth = numbered(folder, r"frame-(\d{1,9})\.depth\.png")
     numbers = paired(color, depth, folder)
     colors, depths = list(color.values()), list(depth.values())
-    color_size = common_size(colors)
-    camera, notes = _camera(folder, common_size(depths))
+    color_size, size = common_size(colors), common_size(depths)
+    camera, notes = _camera(folder, size)
     registration = find_registration(folder, camera, color_size) or _kinect(camera, color_size)
     if registration is None:
-        same_size(colors, depths)
+        require_same_size(color_size, size, folder)
     pose_files = numbered(folder, r"frame-(\d{1,9})\.pose\.txt")
     poses, pose_notes = read_pose_files([pose_files.get(n) for n in numbers])
     name = folder.name if not folder.name.startswith("seq-") else f"{folder.parent.name}-{folder.name}"
