@@ -9,40 +9,44 @@ from ._cpu_field import MASK, OFFSET, corners, locate
 from ._cpu_math import BOTH, HALF, INNER, eight_sums
 from ._cpu_simd import (
     fetch_add,
+    fold,
     isplat,
     lanes,
     load,
+    load16,
     same_bits,
     slide,
     splat,
+    splat16,
     store,
     transpose,
     where_positive,
+    zero_bits,
 )
 from ._cpu_table import scatter_add
-from ._cpu_tile import make_tile
+from ._cpu_tile import COLUMNS, ROWS, make_tile
 
-tile_set = make_tile(4, 2, False, False)
-tile_add = make_tile(4, 2, True, False)
+tile_set = make_tile(False, False)
+tile_add = make_tile(True, False)
 
 
 @njit(**INNER)
 def hidden_back(net, s, first, last, pitch, d_sdf, d_rgb):
     """Turn hidden activations of points first..last into their gradients in place, from ``s.up``; adds the second
     layer's gradients."""
-    for v in range(0, HALF, 8):
-        w, total = load(net.sdf, v), load(d_sdf, v)
+    for v in range(0, HALF, 16):
+        w, total = load16(net.sdf, v), load16(d_sdf, v)
         for p in range(first, last):
-            h, g = load(s.hidden, BOTH * p + v), splat(s.up[p])
+            h, g = load16(s.hidden, BOTH * p + v), splat16(s.up[p])
             total = total + g * h
             store(s.hidden, BOTH * p + v, where_positive(h, g * w))
         store(d_sdf, v, total)
-    for v in range(0, HALF, 8):
-        wr, wg, wb = load(net.rgb, v), load(net.rgb, HALF + v), load(net.rgb, 2 * HALF + v)
-        tr, tg, tb = load(d_rgb, v), load(d_rgb, HALF + v), load(d_rgb, 2 * HALF + v)
+    for v in range(0, HALF, 16):
+        wr, wg, wb = load16(net.rgb, v), load16(net.rgb, HALF + v), load16(net.rgb, 2 * HALF + v)
+        tr, tg, tb = load16(d_rgb, v), load16(d_rgb, HALF + v), load16(d_rgb, 2 * HALF + v)
         for p in range(first, last):
-            h = load(s.hidden, BOTH * p + HALF + v)
-            r, g, b = splat(s.up[pitch + p]), splat(s.up[2 * pitch + p]), splat(s.up[3 * pitch + p])
+            h = load16(s.hidden, BOTH * p + HALF + v)
+            r, g, b = splat16(s.up[pitch + p]), splat16(s.up[2 * pitch + p]), splat16(s.up[3 * pitch + p])
             tr, tg, tb = tr + r * h, tg + g * h, tb + b * h
             store(s.hidden, BOTH * p + HALF + v, where_positive(h, r * wr + g * wg + b * wb))
         store(d_rgb, v, tr)
@@ -55,8 +59,8 @@ def features_back(net, s, first, last, pitch, begin, end):
     """Gradients of the hash features of points first..last from hidden units begin..end, into ``s.d_enc``."""
     padded = net.padded
     for p in range(first, last, 8):
-        for i in range(0, 8, 4):
-            for v in range(0, padded, 16):
+        for i in range(0, 8, ROWS):
+            for v in range(0, padded, COLUMNS):
                 tile_set(
                     s.turn, i * padded + v, padded, s.hidden, BOTH * (p + i) + begin, BOTH, 1,
                     net.features_t, begin * padded + v, padded, end - begin,
@@ -72,18 +76,18 @@ def blob_back(blob, bins, s, p, pitch, begin, end):
     i = BOTH * s.bin[p]
     j = BOTH * (s.bin[pitch + p] + bins + 2)
     k = BOTH * (s.bin[2 * pitch + p] + 2 * (bins + 2))
-    a, b, c = splat(s.slope[p]), splat(s.slope[2 * pitch + p]), splat(s.slope[4 * pitch + p])
-    d, e, f = splat(s.slope[pitch + p]), splat(s.slope[3 * pitch + p]), splat(s.slope[5 * pitch + p])
-    x = y = z = splat(np.float32(0))
-    for v in range(begin, end, 8):
-        g = load(s.hidden, BOTH * p + v)
-        x = x + g * (a * load(blob, i + v) + d * load(blob, i + v + BOTH))
-        y = y + g * (b * load(blob, j + v) + e * load(blob, j + v + BOTH))
-        z = z + g * (c * load(blob, k + v) + f * load(blob, k + v + BOTH))
+    a, b, c = splat16(s.slope[p]), splat16(s.slope[2 * pitch + p]), splat16(s.slope[4 * pitch + p])
+    d, e, f = splat16(s.slope[pitch + p]), splat16(s.slope[3 * pitch + p]), splat16(s.slope[5 * pitch + p])
+    x = y = z = splat16(np.float32(0))
+    for v in range(begin, end, 16):
+        g = load16(s.hidden, BOTH * p + v)
+        x = x + g * (a * load16(blob, i + v) + d * load16(blob, i + v + BOTH))
+        y = y + g * (b * load16(blob, j + v) + e * load16(blob, j + v + BOTH))
+        z = z + g * (c * load16(blob, k + v) + f * load16(blob, k + v + BOTH))
     at = 8 * (p & 7)
-    store(s.turn, at, x)
-    store(s.turn, at + 64, y)
-    store(s.turn, at + 128, z)
+    store(s.turn, at, fold(x))
+    store(s.turn, at + 64, fold(y))
+    store(s.turn, at + 128, fold(z))
 
 
 @njit(**INNER)
@@ -108,8 +112,8 @@ def points_back(grid, net, s, first, last, pitch, begin, end):
 @njit(**INNER)
 def weights_back(grid, net, s, first, last, pitch, d_features, d_blob):
     """Add the first layer's gradients from points first..last: d_features [padded, 64], d_blob [3, bins + 2, 64]."""
-    for v in range(0, BOTH, 16):
-        for i in range(0, net.padded, 4):
+    for v in range(0, BOTH, COLUMNS):
+        for i in range(0, net.padded, ROWS):
             tile_add(
                 d_features, BOTH * i + v, BOTH, s.enc, i * pitch + first, pitch, 1,
                 s.hidden, BOTH * first + v, BOTH, last - first,
@@ -122,39 +126,31 @@ def weights_back(grid, net, s, first, last, pitch, d_features, d_blob):
 @njit(**INNER)
 def blob_weights_back(s, first, last, pitch, axis, v, d_blob):
     """Thirty-two columns of ``weights_back`` for one axis: neighbours share their bins, so sums stay in registers."""
-    zero = splat(np.float32(0))
-    none = (zero, zero, zero, zero, zero, zero)
-    left, right = none, none
+    zero = splat16(np.float32(0))
+    left, right = (zero, zero, zero), (zero, zero, zero)
     last_bin = s.bin[axis * pitch + first]
     for p in range(first, last):
         own = s.bin[axis * pitch + p]
         if own != last_bin:
             add_sums(d_blob, BOTH * last_bin + v, left)
             add_sums(d_blob, BOTH * last_bin + v + 16, right)
-            left, right = none, none
+            left, right = (zero, zero, zero), (zero, zero, zero)
             last_bin = own
         at = 3 * axis * pitch + p
-        a, b, c = splat(s.coef[at]), splat(s.coef[at + pitch]), splat(s.coef[at + 2 * pitch])
-        left = grown(left, a, b, c, s.hidden, BOTH * p + v)
-        right = grown(right, a, b, c, s.hidden, BOTH * p + v + 16)
+        a, b, c = splat16(s.coef[at]), splat16(s.coef[at + pitch]), splat16(s.coef[at + 2 * pitch])
+        g, h = load16(s.hidden, BOTH * p + v), load16(s.hidden, BOTH * p + v + 16)
+        left = left[0] + a * g, left[1] + b * g, left[2] + c * g
+        right = right[0] + a * h, right[1] + b * h, right[2] + c * h
     add_sums(d_blob, BOTH * last_bin + v, left)
     add_sums(d_blob, BOTH * last_bin + v + 16, right)
-
-
-@njit(**INNER)
-def grown(sums, a, b, c, hidden, at):
-    """Sums of three rows of sixteen columns, with a, b and c times sixteen hidden gradients added."""
-    g, h = load(hidden, at), load(hidden, at + 8)
-    return sums[0] + a * g, sums[1] + a * h, sums[2] + b * g, sums[3] + b * h, sums[4] + c * g, sums[5] + c * h
 
 
 @njit(**INNER)
 def add_sums(target, at, sums):
     """Add sixteen columns of three rows, BOTH apart."""
     for row in range(3):
-        for half in range(2):
-            place = at + row * BOTH + 8 * half
-            store(target, place, load(target, place) + sums[2 * row + half])
+        place = at + row * BOTH
+        store(target, place, load16(target, place) + sums[row])
 
 
 @njit(**INNER)
@@ -173,7 +169,7 @@ def table_back(grid, level, x, d_enc, at_a, n, pitch, rows, parts, d_table):
     level's two from ``at_a`` on.
 
     Neighbours on a ray often share a cell: their sums stay in registers, one lane per corner, until the cell changes.
-    rows: int32 [3, 64] and parts: float32 [24] are scratch.
+    rows: int32 [2, 64] and parts: float32 [40] are scratch.
     """
     zero = splat(np.float32(0))
     ux, uy, uz = lanes(-1, 1, -1, 1, -1, 1, -1, 1), lanes(-1, -1, 1, 1, -1, -1, 1, 1), lanes(-1, -1, -1, -1, 1, 1, 1, 1)
@@ -181,28 +177,29 @@ def table_back(grid, level, x, d_enc, at_a, n, pitch, rows, parts, d_table):
     last_x, last_y, last_z = isplat(-(2**31)), isplat(-(2**31)), isplat(-(2**31))
     sum_a, sum_b = zero, zero
     run, live = 0, False
-    at_b = at_a + pitch
     for p in range(0, n, 8):
         ix, iy, iz, fx, fy, fz = locate(grid, level, x, p, pitch)
-        corners(grid.levels, level, ix, iy, iz, rows)
-        own = 64 + 8 * (p & 8)
-        transpose(rows, 0, 8, rows, own, 8)
+        own = 8 * (p & 8)
+        corners(grid.levels, level, ix, iy, iz, rows, own)
         store(parts, 0, fx)
         store(parts, 8, fy)
         store(parts, 16, fz)
+        a, b = load(d_enc, at_a + p), load(d_enc, at_a + pitch + p)
+        store(parts, 24, a)
+        store(parts, 32, b)
+        none = zero_bits(a) & zero_bits(b)
         same = same_bits(slide(last_x, ix), ix) & same_bits(slide(last_y, iy), iy) & same_bits(slide(last_z, iz), iz)
         last_x, last_y, last_z = ix, iy, iz
         for i in range(8):
             if live and not (same >> i) & 1:
                 scatter_add(d_table, rows, run, sum_a, sum_b)
                 live = False
-            run = own + 8 * i
-            a, b = d_enc[at_a + p + i], d_enc[at_b + p + i]
-            if a == 0 and b == 0:
+            run = own + i
+            if (none >> i) & 1:
                 continue
             if not live:
                 live, sum_a, sum_b = True, zero, zero
             w = (bx + ux * splat(parts[i])) * (by + uy * splat(parts[8 + i])) * (bz + uz * splat(parts[16 + i]))
-            sum_a, sum_b = sum_a + w * splat(a), sum_b + w * splat(b)
+            sum_a, sum_b = sum_a + w * splat(parts[24 + i]), sum_b + w * splat(parts[32 + i])
     if live:
         scatter_add(d_table, rows, run, sum_a, sum_b)

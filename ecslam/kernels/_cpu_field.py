@@ -11,17 +11,32 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ._cpu_math import BOTH, HALF, INNER, dots, sigmoid
-from ._cpu_simd import exact_fma, floor, fma, highest, isplat, load, lowest, splat, store, to_int
+from ._cpu_math import BOTH, HALF, INNER, PART, dots, sigmoid
+from ._cpu_simd import (
+    exact_fma,
+    floor,
+    fma,
+    highest,
+    isplat,
+    load,
+    load16,
+    lowest,
+    splat,
+    splat16,
+    store,
+    to_int,
+    twice,
+    unzip,
+)
 from ._cpu_table import gather
-from ._cpu_tile import make_tile
+from ._cpu_tile import COLUMNS, ROWS, make_tile
 
 BLOCK = 32  # points whose hidden units stay in the first-level cache through all passes
 P1, P2 = -1640531535, 805459861
 OFFSET, MASK, FIRST, DIMS = 0, 1, 2, 5
 ANCHOR, BLOB_LOW, BLOB_INV, LOW, HIGH = 0, 3, 6, 9, 12
 
-tile_relu = make_tile(4, 2, True, True)
+tile_relu = make_tile(True, True)
 
 
 class Grid(NamedTuple):
@@ -36,8 +51,8 @@ class Grid(NamedTuple):
 
 class Net(NamedTuple):
     """The decoders as jitted code reads them, flat. features: [padded, 64]; features_t: [64, padded]; blob:
-    [3, bins + 2, 64], wrapped around; blob_steps: its differences
-    between rows; sdf: [32]; rgb: [3, 32]. padded: number of hash features, padded to 16."""
+    [3, bins + 2, 64], wrapped around; blob_steps: its differences between rows; sdf: [32]; rgb: [3, 32]. padded:
+    number of hash features, up to whole tiles."""
 
     features: np.ndarray
     features_t: np.ndarray
@@ -54,7 +69,7 @@ class Scratch(NamedTuple):
     enc: features [padded]; jac: their derivatives per metre [3 padded]; bin: first of three bins [3]; coef: bin values
     [9]; slope: d(bin value)/dx at the outer two [6]; hidden: [pitch, 64]; out: TSDF, colour [4]; up: gradients of
     those before the sigmoid [4]; d_enc [padded]; d_x [3]; turn: for transposing; alpha, before, weight, sharp: for
-    rendering; rows: corners of eight cells [64]."""
+    rendering; rows: of the table at cells' corners [8]; part: fractions of a cell [3]."""
 
     world: np.ndarray
     x: np.ndarray
@@ -75,11 +90,13 @@ class Scratch(NamedTuple):
     weight: np.ndarray
     sharp: np.ndarray
     rows: np.ndarray
+    part: np.ndarray
 
 
 def scratch_floats(pitch, padded):
     """Sizes of the two flat buffers that ``carve`` cuts up: what a chunk leaves behind, and the rest."""
-    return pitch * (6 + padded), pitch * (4 * padded + 6 + 3 + 3 + 9 + 6 + BOTH + 4 + 4 + 3 + 4) + 8 * padded + 256
+    each = 4 * padded + 6 + 3 + 3 + 9 + 6 + BOTH + 4 + 4 + 3 + 8 + 3 + 4
+    return pitch * (6 + padded), pitch * each + 8 * padded + 192
 
 
 @njit(**INNER)
@@ -110,8 +127,11 @@ def carve(kept, buffer, pitch, padded):
     at += 3 * pitch
     turn = buffer[at : at + 8 * padded + 192]
     at += 8 * padded + 192
+    rows = buffer[at : at + 8 * pitch].view(np.int32)
+    at += 8 * pitch
+    part = buffer[at : at + 3 * pitch]
+    at += 3 * pitch
     rest = buffer[at : at + 4 * pitch]
-    rows = buffer[at + 4 * pitch : at + 4 * pitch + 64].view(np.int32)
     alpha, before, weight, sharp = rest[:pitch], rest[pitch : 2 * pitch], rest[2 * pitch : 3 * pitch], rest[3 * pitch :]
     return Scratch(
         world,
@@ -133,6 +153,7 @@ def carve(kept, buffer, pitch, padded):
         weight,
         sharp,
         rows,
+        part,
     )
 
 
@@ -206,7 +227,7 @@ def inside_block(cell, fraction, first, count):
 
 
 @njit(**INNER)
-def corners(levels, level, x, y, z, rows):
+def corners(levels, level, x, y, z, rows, at):
     """Table rows [8, 8] of the eight corners (x fastest) of eight cells with integer coordinates x, y, z."""
     one, offset = isplat(1), isplat(levels[level, OFFSET])
     nx, ny = levels[level, DIMS], levels[level, DIMS + 1]
@@ -216,61 +237,63 @@ def corners(levels, level, x, y, z, rows):
         a = x + y * row + z * slab + (offset - isplat(first))
         b, c = a + row, a + slab
         d = c + row
-        store(rows, 0, a)
-        store(rows, 8, a + one)
-        store(rows, 16, b)
-        store(rows, 24, b + one)
-        store(rows, 32, c)
-        store(rows, 40, c + one)
-        store(rows, 48, d)
-        store(rows, 56, d + one)
+        store(rows, at, a)
+        store(rows, at + 8, a + one)
+        store(rows, at + 16, b)
+        store(rows, at + 24, b + one)
+        store(rows, at + 32, c)
+        store(rows, at + 40, c + one)
+        store(rows, at + 48, d)
+        store(rows, at + 56, d + one)
     else:
         mask, x1 = isplat(levels[level, MASK]), x + one
         y0, z0 = y * isplat(P1), z * isplat(P2)
         y1, z1 = y0 + isplat(P1), z0 + isplat(P2)
         a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
-        store(rows, 0, ((a ^ x) & mask) + offset)
-        store(rows, 8, ((a ^ x1) & mask) + offset)
-        store(rows, 16, ((b ^ x) & mask) + offset)
-        store(rows, 24, ((b ^ x1) & mask) + offset)
-        store(rows, 32, ((c ^ x) & mask) + offset)
-        store(rows, 40, ((c ^ x1) & mask) + offset)
-        store(rows, 48, ((d ^ x) & mask) + offset)
-        store(rows, 56, ((d ^ x1) & mask) + offset)
+        store(rows, at, ((a ^ x) & mask) + offset)
+        store(rows, at + 8, ((a ^ x1) & mask) + offset)
+        store(rows, at + 16, ((b ^ x) & mask) + offset)
+        store(rows, at + 24, ((b ^ x1) & mask) + offset)
+        store(rows, at + 32, ((c ^ x) & mask) + offset)
+        store(rows, at + 40, ((c ^ x1) & mask) + offset)
+        store(rows, at + 48, ((d ^ x) & mask) + offset)
+        store(rows, at + 56, ((d ^ x1) & mask) + offset)
 
 
 @njit(**INNER)
-def mix(v, fx, fy, fz):
-    """Trilinear value of eight corner values and its derivatives per cell."""
-    a, b, c, d = v[1] - v[0], v[3] - v[2], v[5] - v[4], v[7] - v[6]
-    p, q, r, s = v[0] + fx * a, v[2] + fx * b, v[4] + fx * c, v[6] + fx * d
+def interpolate(table, rows, at, fx, fy, fz):
+    """Both features at eight points, trilinear, from their cells' ``rows`` [64], and their derivatives per cell."""
+    fx, fy, fz = twice(fx), twice(fy), twice(fz)
+    v0, v1 = gather(table, rows, at), gather(table, rows, at + 8)
+    v2, v3 = gather(table, rows, at + 16), gather(table, rows, at + 24)
+    v4, v5 = gather(table, rows, at + 32), gather(table, rows, at + 40)
+    v6, v7 = gather(table, rows, at + 48), gather(table, rows, at + 56)
+    a, b, c, d = v1 - v0, v3 - v2, v5 - v4, v7 - v6
+    p, q, r, s = v0 + fx * a, v2 + fx * b, v4 + fx * c, v6 + fx * d
     low, high = q - p, s - r
     bottom, top = p + fy * low, r + fy * high
     near, far = a + fy * (b - a), c + fy * (d - c)
     rise = top - bottom
-    return bottom + fz * rise, near + fz * (far - near), low + fz * (high - low), rise
-
-
-@njit(**INNER)
-def at_corners(table, rows):
-    """Both features at the corners of eight cells, eight vectors each, from their ``rows`` [64]."""
-    a, b, c, d = gather(table, rows, 0), gather(table, rows, 8), gather(table, rows, 16), gather(table, rows, 24)
-    e, f, g, h = gather(table, rows, 32), gather(table, rows, 40), gather(table, rows, 48), gather(table, rows, 56)
-    return (a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0]), (a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1])
+    return unzip(bottom + fz * rise), unzip(near + fz * (far - near)), unzip(low + fz * (high - low)), unzip(rise)
 
 
 @njit(**INNER)
 def encode(grid, table, s, n, pitch, padded, want_jac):
-    """Hash features of the points in ``s.x`` (paper, equation 1) and, if wanted, their derivatives."""
-    rows = s.rows
+    """Hash features of the points in ``s.x`` (paper, equation 1) and, if wanted, their derivatives.
+
+    A level's rows are found for all points first, so that many reads of the table are under way at once.
+    """
     for level in range(grid.levels.shape[0]):
         inverse = splat(grid.inverse[level, 0])
         for p in range(0, n, 8):
             x, y, z, fx, fy, fz = locate(grid, level, s.x, p, pitch)
-            corners(grid.levels, level, x, y, z, rows)
-            first, second = at_corners(table, rows)
-            v0, x0, y0, z0 = mix(first, fx, fy, fz)
-            v1, x1, y1, z1 = mix(second, fx, fy, fz)
+            corners(grid.levels, level, x, y, z, s.rows, 8 * p)
+            store(s.part, p, fx)
+            store(s.part, pitch + p, fy)
+            store(s.part, 2 * pitch + p, fz)
+        for p in range(0, n, 8):
+            fx, fy, fz = load(s.part, p), load(s.part, pitch + p), load(s.part, 2 * pitch + p)
+            (v0, v1), (x0, x1), (y0, y1), (z0, z1) = interpolate(table, s.rows, 8 * p, fx, fy, fz)
             at = 2 * level * pitch + p
             store(s.enc, at, v0)
             store(s.enc, at + pitch, v1)
@@ -290,13 +313,13 @@ def blob_layer(blob, bins, s, first, last, pitch):
         i = BOTH * s.bin[p]
         j = BOTH * (s.bin[pitch + p] + bins + 2)
         k = BOTH * (s.bin[2 * pitch + p] + 2 * (bins + 2))
-        a, b, c = splat(s.coef[p]), splat(s.coef[pitch + p]), splat(s.coef[2 * pitch + p])
-        d, e, f = splat(s.coef[3 * pitch + p]), splat(s.coef[4 * pitch + p]), splat(s.coef[5 * pitch + p])
-        g, h, m = splat(s.coef[6 * pitch + p]), splat(s.coef[7 * pitch + p]), splat(s.coef[8 * pitch + p])
-        for v in range(0, BOTH, 8):
-            x = a * load(blob, i + v) + b * load(blob, i + v + BOTH) + c * load(blob, i + v + 2 * BOTH)
-            y = d * load(blob, j + v) + e * load(blob, j + v + BOTH) + f * load(blob, j + v + 2 * BOTH)
-            z = g * load(blob, k + v) + h * load(blob, k + v + BOTH) + m * load(blob, k + v + 2 * BOTH)
+        a, b, c = splat16(s.coef[p]), splat16(s.coef[pitch + p]), splat16(s.coef[2 * pitch + p])
+        d, e, f = splat16(s.coef[3 * pitch + p]), splat16(s.coef[4 * pitch + p]), splat16(s.coef[5 * pitch + p])
+        g, h, m = splat16(s.coef[6 * pitch + p]), splat16(s.coef[7 * pitch + p]), splat16(s.coef[8 * pitch + p])
+        for v in range(0, BOTH, 16):
+            x = a * load16(blob, i + v) + b * load16(blob, i + v + BOTH) + c * load16(blob, i + v + 2 * BOTH)
+            y = d * load16(blob, j + v) + e * load16(blob, j + v + BOTH) + f * load16(blob, j + v + 2 * BOTH)
+            z = g * load16(blob, k + v) + h * load16(blob, k + v + BOTH) + m * load16(blob, k + v + 2 * BOTH)
             store(s.hidden, BOTH * p + v, x + y + z)
 
 
@@ -310,7 +333,7 @@ def decode(net, s, first, last, pitch):
             store(s.out, (channel + 1) * pitch + p, sigmoid(raw))
 
 
-@njit(**INNER)
+@njit(**PART)
 def forward(grid, table, net, s, n, pitch, want_jac):
     """From world positions in ``s.world`` to TSDF and colour in ``s.out``; n is a multiple of 8."""
     place(grid, s, n, pitch)
@@ -319,7 +342,7 @@ def forward(grid, table, net, s, n, pitch, want_jac):
     for first in range(0, n, BLOCK):
         last = min(first + BLOCK, n)
         blob_layer(net.blob, grid.bins, s, first, last, pitch)
-        for p in range(first, last, 4):
-            for v in range(0, BOTH, 16):
+        for p in range(first, last, ROWS):
+            for v in range(0, BOTH, COLUMNS):
                 tile_relu(s.hidden, BOTH * p + v, BOTH, s.enc, p, 1, pitch, net.features, v, BOTH, net.padded)
         decode(net, s, first, last, pitch)

@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ._cpu_simd import floor, fma, highest, load, lowest, power_of_two, row_sums, splat
+from ._cpu_simd import floor, fma, fold, highest, load, load16, lowest, power_of_two, row_sums, splat
 
 OUTER = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "cache": True}
-INNER = {**OUTER, "cache": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+# Without counts of references to the arrays passed in: they are atomic, so each stops the processor from reading ahead.
+# Such functions cannot make arrays.
+WORKER = {**OUTER, "_nrt": False}
+# What is not inlined is compiled for itself and with each caller, and which of the two runs depends on whether the
+# caller was read from disk: they need not round alike.
+PART = {**WORKER, "cache": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+INNER = {**PART, "forceinline": True}
 BOTH = 64
 HALF = 32
 
@@ -16,9 +22,7 @@ HALF = 32
 @njit(**INNER)
 def dot(a, i, b, j):
     """Lane-wise partial sums of the dot product of two rows of 32."""
-    return (load(a, i) * load(b, j) + load(a, i + 8) * load(b, j + 8)) + (
-        load(a, i + 16) * load(b, j + 16) + load(a, i + 24) * load(b, j + 24)
-    )
+    return fold(load16(a, i) * load16(b, j) + load16(a, i + 16) * load16(b, j + 16))
 
 
 @njit(**INNER)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ._cpu_math import OUTER
+from ._cpu_math import INNER, OUTER
 
 SMALL = 1e-8  # squared angle below which Rodrigues' factors are taken from their series
 
@@ -33,7 +33,7 @@ def pose_worker(c2w, d_c2w, mean, square, rates, about, decays, epsilon, count, 
         moved[p, 3] = c2w[p, 3]
 
 
-@njit(**OUTER)
+@njit(**INNER)
 def tangent_gradient(pose, d_pose, about, p, out):
     """See ``se3.tangent_gradient``: [6] into ``out``."""
     for i in range(3):
@@ -45,7 +45,7 @@ def tangent_gradient(pose, d_pose, about, p, out):
                 out[3 + i] += about[p, k] * (pose[last, k] * d_pose[after, 3] - pose[after, k] * d_pose[last, 3])
 
 
-@njit(**OUTER)
+@njit(**INNER)
 def rotation(x, y, z, out):
     """See ``se3.so3_exp``: [3, 3] into ``out``."""
     angle_square = x * x + y * y + z * z

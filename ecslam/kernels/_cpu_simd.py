@@ -16,7 +16,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 LANES = 8
 FAST = ("contract", "nsz")
 FLOAT, INT = ir.FloatType(), ir.IntType(32)
-FLOATS, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
+FLOATS, INTS, WIDE = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES), ir.VectorType(FLOAT, 2 * LANES)
 
 
 class FloatVector(types.Type):  # type: ignore[misc]
@@ -33,6 +33,13 @@ class IntVector(types.Type):  # type: ignore[misc]
         super().__init__("i32x8")
 
 
+class WideVector(types.Type):  # type: ignore[misc]
+    """Sixteen float32: of hidden units, or rows of two of the hash table for eight points."""
+
+    def __init__(self):
+        super().__init__("f32x16")
+
+
 @register_model(FloatVector)
 class _FloatModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager, kind):
@@ -45,7 +52,13 @@ class _IntModel(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, kind, INTS)
 
 
-f32x8, i32x8 = FloatVector(), IntVector()
+@register_model(WideVector)
+class _WideModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, WIDE)
+
+
+f32x8, i32x8, f32x16 = FloatVector(), IntVector(), WideVector()
 
 
 def _operator(function, kind, emit):
@@ -58,9 +71,10 @@ def _operator(function, kind, emit):
         return emit(builder, *args)
 
 
-_operator(operator.add, f32x8, lambda b, x, y: b.fadd(x, y, flags=FAST))
-_operator(operator.sub, f32x8, lambda b, x, y: b.fsub(x, y, flags=FAST))
-_operator(operator.mul, f32x8, lambda b, x, y: b.fmul(x, y, flags=FAST))
+for _kind in (f32x8, f32x16):
+    _operator(operator.add, _kind, lambda b, x, y: b.fadd(x, y, flags=FAST))
+    _operator(operator.sub, _kind, lambda b, x, y: b.fsub(x, y, flags=FAST))
+    _operator(operator.mul, _kind, lambda b, x, y: b.fmul(x, y, flags=FAST))
 _operator(operator.truediv, f32x8, lambda b, x, y: b.fdiv(x, y, flags=FAST))
 _operator(operator.add, i32x8, lambda b, x, y: b.add(x, y))
 _operator(operator.sub, i32x8, lambda b, x, y: b.sub(x, y))
@@ -71,7 +85,11 @@ _operator(operator.and_, i32x8, lambda b, x, y: b.and_(x, y))
 
 def emit_splat(builder, value, kind):
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, INT(0))
-    return builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(INTS, [0] * LANES))
+    return emit_shuffle(builder, one, one, [0] * kind.count)
+
+
+def emit_shuffle(builder, a, b, lanes):
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(lanes)), list(lanes)))
 
 
 def emit_pointer(context, builder, kind, array, index, element):
@@ -92,6 +110,16 @@ def splat(typing, value):
         return emit_splat(builder, context.cast(builder, args[0], value, types.float32), FLOATS)
 
     return f32x8(value), generate
+
+
+@intrinsic
+def splat16(typing, value):
+    """The float ``value`` in every lane of sixteen."""
+
+    def generate(context, builder, signature, args):
+        return emit_splat(builder, context.cast(builder, args[0], value, types.float32), WIDE)
+
+    return f32x16(value), generate
 
 
 @intrinsic
@@ -118,8 +146,19 @@ def load(typing, array, index):
 
 
 @intrinsic
+def load16(typing, array, index):
+    """Lanes array[index : index + 16] of a contiguous one-dimensional float32 array."""
+
+    def generate(context, builder, signature, args):
+        index = context.cast(builder, args[1], signature.args[1], types.intp)
+        return builder.load(emit_pointer(context, builder, array, args[0], index, WIDE), align=4)
+
+    return f32x16(array, index), generate
+
+
+@intrinsic
 def store(typing, array, index, value):
-    """Write the lanes to array[index : index + 8]."""
+    """Write the lanes to array[index :]."""
 
     def generate(context, builder, signature, args):
         index = context.cast(builder, args[1], signature.args[1], types.intp)
@@ -182,10 +221,10 @@ def where_positive(typing, a, b):
     """b where a > 0, else 0."""
 
     def generate(context, builder, signature, args):
-        zero = ir.Constant(FLOATS, [0.0] * LANES)
+        zero = ir.Constant(args[0].type, [0.0] * args[0].type.count)
         return builder.select(builder.fcmp_ordered(">", args[0], zero), args[1], zero)
 
-    return f32x8(a, b), generate
+    return a(a, b), generate
 
 
 @intrinsic
@@ -200,8 +239,36 @@ def power_of_two(typing, a):
     return f32x8(a), generate
 
 
-def emit_shuffle(builder, a, b, lanes):
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(lanes)), list(lanes)))
+@intrinsic
+def twice(typing, a):
+    """Each lane two times, one beside the other."""
+
+    def generate(context, builder, signature, args):
+        return emit_shuffle(builder, args[0], args[0], [i // 2 for i in range(2 * LANES)])
+
+    return f32x16(a), generate
+
+
+@intrinsic
+def unzip(typing, a):
+    """The first and the second of each pair of lanes."""
+
+    def generate(context, builder, signature, args):
+        parts = [emit_shuffle(builder, args[0], args[0], range(i, 2 * LANES, 2)) for i in range(2)]
+        return context.make_tuple(builder, signature.return_type, parts)
+
+    return types.UniTuple(f32x8, 2)(a), generate
+
+
+@intrinsic
+def fold(typing, a):
+    """The first eight lanes plus the last."""
+
+    def generate(context, builder, signature, args):
+        low, high = (emit_shuffle(builder, args[0], args[0], range(i, i + LANES)) for i in (0, LANES))
+        return builder.fadd(low, high, flags=FAST)
+
+    return f32x8(a), generate
 
 
 # The three butterfly stages of an 8 x 8 transpose.
@@ -270,6 +337,18 @@ def same_bits(typing, a, b):
         return builder.zext(mask, ir.IntType(64))
 
     return types.int64(a, b), generate
+
+
+@intrinsic
+def zero_bits(typing, a):
+    """Bit i is set where lane i is zero."""
+
+    def generate(context, builder, signature, args):
+        zero = ir.Constant(FLOATS, [0.0] * LANES)
+        mask = builder.bitcast(builder.fcmp_ordered("==", args[0], zero), ir.IntType(LANES))
+        return builder.zext(mask, ir.IntType(64))
+
+    return types.int64(a), generate
 
 
 @intrinsic

@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 
 from ._cpu_back import next_level, table_back
-from ._cpu_field import ANCHOR, at_corners, corners, locate, mix
-from ._cpu_math import INNER, OUTER
+from ._cpu_field import ANCHOR, corners, interpolate, locate
+from ._cpu_math import INNER, OUTER, WORKER
 from ._cpu_simd import store
 
 
@@ -16,10 +16,10 @@ def level_features(grid, level, table, x, n, rows, feature):
     """Both features [2 n] of one level at points x [6, n]; n is a multiple of 8."""
     for p in range(0, n, 8):
         ix, iy, iz, fx, fy, fz = locate(grid, level, x, p, n)
-        corners(grid.levels, level, ix, iy, iz, rows)
-        first, second = at_corners(table, rows)
-        store(feature, p, mix(first, fx, fy, fz)[0])
-        store(feature, n + p, mix(second, fx, fy, fz)[0])
+        corners(grid.levels, level, ix, iy, iz, rows, 0)
+        first, second = interpolate(table, rows, 0, fx, fy, fz)[0]
+        store(feature, p, first)
+        store(feature, n + p, second)
 
 
 @njit(**INNER)
@@ -47,12 +47,12 @@ def from_anchor(grid, points, x):
             x[(3 + axis) * n + i] = exact - np.float64(x[axis * n + i])
 
 
-@njit(**OUTER)
+@njit(**WORKER)
 def smooth_worker(t, counter, scratch, grid, table, x, side, d_table):
-    """Gradient of the whole table; scratch: float32 [threads, 4 n]."""
+    """Gradient of the whole table; scratch: float32 [threads, 4 n + 168]."""
     n = x.shape[0] // 6
-    feature, d_feature = scratch[t, : 2 * n], scratch[t, 2 * n :]
-    rows, parts = np.empty(192, np.int32), np.empty(24, np.float32)
+    feature, d_feature, rest = scratch[t, : 2 * n], scratch[t, 2 * n : 4 * n], scratch[t, 4 * n :]
+    rows, parts = rest[:128].view(np.int32), rest[128:]
     while True:
         level = next_level(counter, grid, d_table)
         if level < 0:

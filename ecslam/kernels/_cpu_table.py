@@ -6,7 +6,7 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic
 
-from ._cpu_simd import FLOAT, INT, LANES, emit_pointer, emit_shuffle, f32x8
+from ._cpu_simd import FLOAT, INT, LANES, emit_pointer, emit_shuffle, f32x16
 
 PAIR = ir.VectorType(FLOAT, 2)
 
@@ -19,40 +19,31 @@ def _row(context, builder, kind, table, index):
 
 @intrinsic
 def gather(typing, table, rows, start):
-    """Both floats of the rows ``rows[start : start + 8]`` of a flat table of rows of two.
-
-    The row numbers come from memory, one load each: cheaper than taking a vector apart, which LLVM would rather do
-    when it sees them being stored, hence the (free) monotonic loads.
-    """
+    """The rows ``rows[start : start + 8]`` of a flat table of rows of two."""
 
     def generate(context, builder, signature, args):
         start = context.cast(builder, args[2], signature.args[2], types.intp)
-        pairs = []
+        parts = []
         for i in range(LANES):
             at = builder.add(start, ir.Constant(start.type, i))
-            index = builder.load_atomic(emit_pointer(context, builder, rows, args[1], at, INT), "monotonic", 4)
-            pairs.append(builder.load(_row(context, builder, table, args[0], index), align=4))
+            index = builder.load(emit_pointer(context, builder, rows, args[1], at, INT), align=4)
+            parts.append(builder.load(_row(context, builder, table, args[0], index), align=4))
+        while len(parts) > 1:
+            width = 2 * parts[0].type.count
+            parts = [emit_shuffle(builder, a, b, range(width)) for a, b in zip(parts[::2], parts[1::2], strict=True)]
+        return parts[0]
 
-        def join(order):
-            left, right = (emit_shuffle(builder, pairs[a], pairs[b], range(4)) for a, b in (order[:2], order[2:]))
-            return emit_shuffle(builder, left, right, range(8))
-
-        low, high = join((0, 1, 4, 5)), join((2, 3, 6, 7))
-        first = emit_shuffle(builder, low, high, [0, 2, 8, 10, 4, 6, 12, 14])
-        second = emit_shuffle(builder, low, high, [1, 3, 9, 11, 5, 7, 13, 15])
-        return context.make_tuple(builder, signature.return_type, [first, second])
-
-    return types.UniTuple(f32x8, 2)(table, rows, start), generate
+    return f32x16(table, rows, start), generate
 
 
 @intrinsic
 def scatter_add(typing, table, rows, start, a, b):
-    """Add a and b to the two floats of the rows ``rows[start : start + 8]`` of a flat table."""
+    """Add a and b to the two floats of the rows ``rows[start :: 8]``, eight of them, of a flat table."""
 
     def generate(context, builder, signature, args):
         start = context.cast(builder, args[2], signature.args[2], types.intp)
         for i in range(LANES):
-            at = builder.add(start, ir.Constant(start.type, i))
+            at = builder.add(start, ir.Constant(start.type, LANES * i))
             index = builder.load(emit_pointer(context, builder, rows, args[1], at, INT), align=4)
             pointer = _row(context, builder, table, args[0], index)
             term = emit_shuffle(builder, args[3], args[4], [i, LANES + i])

@@ -1,17 +1,31 @@
-"""Register tiles of matrix products for numba, in the vectors of ``_cpu_simd``."""
+"""Register tiles of matrix products for numba, in vectors as wide as this machine's."""
 
 from __future__ import annotations
 
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import types
+from llvmlite import binding, ir  # type: ignore[import-untyped]
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ._cpu_simd import FLOAT, FLOATS, LANES, emit_call, emit_pointer, emit_splat
+from ._cpu_simd import FLOAT, INT, emit_pointer
 
 
-def make_tile(rows, columns, accumulate, relu):
-    """A register tile of a matrix product: C[rows, 8 columns] (+)= A[rows, n] @ B[n, 8 columns], perhaps clipped at 0.
+def _has(feature):
+    """Whether code is compiled for a processor with ``feature``."""
+    if config.CPU_FEATURES is not None:
+        return f"+{feature}" in config.CPU_FEATURES.split(",")
+    return binding.get_host_cpu_features().get(feature, False)
+
+
+# Sums fill the registers: 8 of AVX2's 16, 16 of AVX-512's 32.
+LANES, ROWS, VECTORS = (16, 8, 2) if _has("avx512f") else (8, 4, 2)
+COLUMNS = VECTORS * LANES
+FLOATS = ir.VectorType(FLOAT, LANES)
+ZERO = ir.Constant(FLOATS, [0.0] * LANES)
+
+
+def make_tile(accumulate, relu):
+    """A register tile of a matrix product: C[ROWS, COLUMNS] (+)= A[ROWS, n] @ B[n, COLUMNS], perhaps clipped at 0.
 
     The jitted function takes (C, start, row stride, A, start, row stride, term stride, B, start, row stride, n), all
     arrays flat float32. One such tile serves the forward pass and both backward passes of the first layer.
@@ -30,37 +44,44 @@ def make_tile(rows, columns, accumulate, relu):
                     index = builder.add(index, builder.mul(step, factor))
                 return emit_pointer(context, builder, kind, array, index, element)
 
+            def vector(j):
+                return ir.Constant(n.type, LANES * j)
+
             places = [
-                at(c, args[0], FLOATS, builder.add(c0, ir.Constant(n.type, LANES * j)), cr, i)
-                for i in range(rows)
-                for j in range(columns)
+                at(c, args[0], FLOATS, builder.add(c0, vector(j)), cr, i) for i in range(ROWS) for j in range(VECTORS)
             ]
             sums = [cgutils.alloca_once(builder, FLOATS) for _ in places]
             for place, total in zip(places, sums, strict=True):
-                start = builder.load(place, align=4) if accumulate else ir.Constant(FLOATS, [0.0] * LANES)
-                builder.store(start, total)
+                builder.store(builder.load(place, align=4) if accumulate else ZERO, total)
             with cgutils.for_range(builder, n) as loop:
                 k = loop.index
                 right = [
-                    builder.load(
-                        at(b, args[7], FLOATS, builder.add(b0, ir.Constant(n.type, LANES * j)), bk, k), align=4
-                    )
-                    for j in range(columns)
+                    builder.load(at(b, args[7], FLOATS, builder.add(b0, vector(j)), bk, k), align=4)
+                    for j in range(VECTORS)
                 ]
-                for i in range(rows):
-                    value = builder.load(at(a, args[3], FLOAT, a0, ar, i, ak, k))
-                    left = emit_splat(builder, value, FLOATS)
-                    for j in range(columns):
-                        total = sums[i * columns + j]
-                        builder.store(emit_call(builder, "llvm.fmuladd", left, right[j], builder.load(total)), total)
-            zero = ir.Constant(FLOATS, [0.0] * LANES)
+                for i in range(ROWS):
+                    left = _splat(builder, builder.load(at(a, args[3], FLOAT, a0, ar, i, ak, k)))
+                    for j in range(VECTORS):
+                        total = sums[i * VECTORS + j]
+                        builder.store(_fma(builder, left, right[j], builder.load(total)), total)
             for place, total in zip(places, sums, strict=True):
                 value = builder.load(total)
                 if relu:
-                    value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
+                    value = builder.select(builder.fcmp_ordered(">", value, ZERO), value, ZERO)
                 builder.store(value, place, align=4)
             return context.get_dummy_value()
 
         return types.void(c, c0, cr, a, a0, ar, ak, b, b0, bk, n), generate
 
     return tile
+
+
+def _splat(builder, value):
+    one = builder.insert_element(ir.Constant(FLOATS, ir.Undefined), value, INT(0))
+    order = ir.Constant(ir.VectorType(INT, LANES), [0] * LANES)
+    return builder.shuffle_vector(one, ir.Constant(FLOATS, ir.Undefined), order)
+
+
+def _fma(builder, a, b, c):
+    kind = ir.FunctionType(FLOATS, [FLOATS] * 3)
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{LANES}f32"), [a, b, c])

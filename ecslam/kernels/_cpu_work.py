@@ -10,7 +10,7 @@ from numba import njit
 
 from ._cpu_back import features_back, hidden_back, next_level, points_back, table_back, weights_back
 from ._cpu_field import BLOCK, carve, forward
-from ._cpu_math import BOTH, HALF, INNER, OUTER
+from ._cpu_math import BOTH, HALF, INNER, OUTER, PART, WORKER
 from ._cpu_rays import compare, composite, pose_sums, rendered, sample_points
 from ._cpu_simd import fetch_add
 
@@ -32,7 +32,7 @@ def load_points(points, first, count, world, n, pitch):
         world[axis * pitch + count : axis * pitch + n] = 0
 
 
-@njit(**OUTER)
+@njit(**WORKER)
 def values_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sdf, rgb):
     """TSDF and colour of points."""
     s = carve(kept[t], buffers[t], pitch, net.padded)
@@ -44,8 +44,8 @@ def values_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sd
         n = up_to_eight(count)
         load_points(points, first, count, s.world, n, pitch)
         forward(grid, table, net, s, n, pitch, False)
-        sdf[first : first + count] = s.out[:count]
         for i in range(count):
+            sdf[first + i] = s.out[i]
             for k in range(3):
                 rgb[first + i, k] = s.out[(k + 1) * pitch + i]
 
@@ -61,8 +61,7 @@ def slopes(grid, table, net, s, count, pitch, want_light):
         for p in range(n):
             c = s.out[at + p]
             s.up[at + p] = LUMINANCE[k] * c * (1 - c) if want_light else 0
-    spare = np.empty(4 * HALF, np.float32)
-    hidden_back(net, s, 0, n, pitch, spare[:HALF], spare[HALF:])
+    hidden_back(net, s, 0, n, pitch, s.turn[:HALF], s.turn[HALF : 4 * HALF])
 
 
 @njit(**INNER)
@@ -79,7 +78,7 @@ def luminance(s, p, pitch):
     return LUMINANCE[0] * s.out[pitch + p] + LUMINANCE[1] * s.out[2 * pitch + p] + LUMINANCE[2] * s.out[3 * pitch + p]
 
 
-@njit(**OUTER)
+@njit(**WORKER)
 def gradients_worker(t, counter, kept, buffers, pitch, grid, net, table, points, sdf, d_sdf, light, d_light):
     """TSDF, luminance and their gradients at points."""
     s = carve(kept[t], buffers[t], pitch, net.padded)
@@ -116,22 +115,20 @@ def add_rows(sums, residual, kernel, j):
 
 
 @njit(**INNER)
-def jacobian(rotated, i, pitch, g, scale, j):
+def jacobian(c2w, world, i, pitch, g, scale, j):
     """Row [6] of the Jacobian of a residual with position gradient ``scale * g``: translation, then rotation."""
-    x, y, z = rotated[i], rotated[pitch + i], rotated[2 * pitch + i]
+    x, y, z = world[i] - c2w[0, 3], world[pitch + i] - c2w[1, 3], world[2 * pitch + i] - c2w[2, 3]
     a, b, c = scale * g[i], scale * g[pitch + i], scale * g[2 * pitch + i]
     j[0], j[1], j[2] = a, b, c
     j[3], j[4], j[5] = y * c - z * b, z * a - x * c, x * b - y * a
 
 
-@njit(**OUTER)
+@njit(**WORKER)
 def align_worker(t, counter, kept, buffers, pitch, grid, net, table, c2w, points, light, settings, sums):
-    """Gauss-Newton sums [chunks, 45]: jtj, jtr, cost, inliers, used."""
+    """Gauss-Newton sums [chunks, 51]: jtj, jtr, cost, inliers, used, and the last row of the Jacobian."""
     truncation, kernel, limit, low, high, colour, colour_kernel = settings
     s = carve(kept[t], buffers[t], pitch, net.padded)
-    rotated = np.empty(3 * pitch)
-    keep = np.empty(pitch, np.bool_)
-    j = np.empty(6)
+    keep = s.weight
     while True:
         chunk = fetch_add(counter, 0)
         first = chunk * pitch
@@ -142,30 +139,30 @@ def align_worker(t, counter, kept, buffers, pitch, grid, net, table, c2w, points
         for i in range(count):
             x, y, z = s.world[i], s.world[pitch + i], s.world[2 * pitch + i]
             for axis in range(3):
-                rotated[axis * pitch + i] = c2w[axis, 0] * x + c2w[axis, 1] * y + c2w[axis, 2] * z
-                s.world[axis * pitch + i] = rotated[axis * pitch + i] + c2w[axis, 3]
+                s.world[axis * pitch + i] = c2w[axis, 0] * x + c2w[axis, 1] * y + c2w[axis, 2] * z + c2w[axis, 3]
         slopes(grid, table, net, s, count, pitch, colour > 0)
         slope_of(grid, net, s, count, pitch, 0)
         total = sums[chunk]
         total[:] = 0
+        j = total[45:]
         for i in range(count):
             a, b, c = s.d_x[i], s.d_x[pitch + i], s.d_x[2 * pitch + i]
             norm = np.sqrt(a * a + b * b + c * c) * truncation
             keep[i] = abs(s.out[i]) < limit and norm > low and norm < high
             if keep[i]:
-                jacobian(rotated, i, pitch, s.d_x, truncation, j)
+                jacobian(c2w, s.world, i, pitch, s.d_x, truncation, j)
                 total[43] += add_rows(total, s.out[i] * truncation, kernel, j) > 0.5
                 total[44] += 1
         if colour > 0:
             slope_of(grid, net, s, count, pitch, 1)
             for i in range(count):
                 if keep[i]:
-                    jacobian(rotated, i, pitch, s.d_x, colour, j)
+                    jacobian(c2w, s.world, i, pitch, s.d_x, colour, j)
                     residual = (luminance(s, i, pitch) - light[first + i]) * colour
                     add_rows(total, residual, colour_kernel * colour, j)
 
 
-@njit(**OUTER)
+@njit(**WORKER)
 def render_worker(t, counter, kept, buffers, chunk_rays, grid, net, table, beta, rays, color, depth, weights):
     """Colour, depth and weights of rays."""
     samples = rays.z.shape[1]
@@ -183,10 +180,11 @@ def render_worker(t, counter, kept, buffers, chunk_rays, grid, net, table, beta,
         for i in range(count):
             r, at = first + i, i * samples
             color[r, 0], color[r, 1], color[r, 2], depth[r] = rendered(rays.z[r], at, s, pitch)
-            weights[r] = s.weight[at : at + samples]
+            for j in range(samples):
+                weights[r, j] = s.weight[at + j]
 
 
-@njit(**OUTER)
+@njit(**WORKER)
 def step_worker(
     t,
     counter,
@@ -241,7 +239,7 @@ def step_worker(
                 pose_sums(rays.z, first, count, s, pitch, sums)
 
 
-@njit(**INNER)
+@njit(**PART)
 def backward(grid, net, s, n, pitch, want_params, want_poses, own, a, b):
     """From ``s.up`` to gradients of positions, features and decoders (``own``: features to a, blob to b, the rest)."""
     for first in range(0, n, BLOCK):
@@ -254,12 +252,12 @@ def backward(grid, net, s, n, pitch, want_params, want_poses, own, a, b):
             points_back(grid, net, s, first, last, pitch, 0, BOTH)
 
 
-@njit(**OUTER)
-def table_worker(t, counter, kept, chunk_rays, grid, padded, total, samples, d_table):
+@njit(**WORKER)
+def table_worker(t, counter, kept, buffers, chunk_rays, grid, padded, total, samples, d_table):
     """Gradient of the whole table from what ``step_loop`` kept: a level belongs to one thread at a time."""
     pitch = up_to_eight(chunk_rays * samples)
     chunks = (total + chunk_rays - 1) // chunk_rays
-    rows, parts = np.empty(192, np.int32), np.empty(24, np.float32)
+    rows, parts = buffers[t, :128].view(np.int32), buffers[t, 128:168]
     while True:
         level = next_level(counter, grid, d_table)
         if level < 0:

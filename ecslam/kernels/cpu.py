@@ -27,6 +27,7 @@ from ._cpu_math import BOTH, HALF
 from ._cpu_poses import pose_worker
 from ._cpu_rays import Rays, count_rays, pose_gradients
 from ._cpu_smooth import from_anchor, smooth_worker
+from ._cpu_tile import COLUMNS
 from ._cpu_work import (
     add_partials,
     align_worker,
@@ -94,7 +95,7 @@ def _grid(layout: GridLayout) -> Grid:
 
 def _net(layout: GridLayout, params: FieldParams) -> Net:
     features = 2 * layout.levels
-    padded = (features + 15) // 16 * 16
+    padded = -(-features // COLUMNS) * COLUMNS
     net = Net(
         _workspace.array("features", padded * BOTH),
         _workspace.array("features_t", BOTH * padded),
@@ -221,7 +222,16 @@ def step(
         )  # fmt: skip
     if into is not None:
         _spread(
-            threads, table_worker, keep, CHUNK_RAYS, grid, net.padded, count, samples, into.table.numpy().reshape(-1)
+            threads,
+            table_worker,
+            keep,
+            buffers,
+            CHUNK_RAYS,
+            grid,
+            net.padded,
+            count,
+            samples,
+            into.table.numpy().reshape(-1),
         )
         targets = (t.numpy() for t in (into.w_in, into.w_sdf, into.w_rgb, into.beta))
         add_partials(partial, 2 * layout.levels, layout.bins, net.padded, *targets)
@@ -238,7 +248,7 @@ def normal_equations(
     n = points.shape[0]
     net, grid = _net(layout, params), _grid(layout)
     threads, *work = _buffers(0, n, CHUNK_POINTS, net.padded)
-    sums = np.zeros((-(-n // CHUNK_POINTS), 45))
+    sums = np.zeros((-(-n // CHUNK_POINTS), 51))
     numbers = settings.numbers()
     table = _array(params.table).reshape(-1)
     _spread(
@@ -275,7 +285,7 @@ def smoothness(layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:
     """See ``reference.smoothness``."""
     n = (len(lattice) + 7) // 8 * 8
     grid, gradient, threads = _grid(layout), torch.empty_like(table), torch.get_num_threads()
-    x, scratch = _workspace.array("lattice", 6 * n), _workspace.array("lattice_features", threads, 4 * n)
+    x, scratch = _workspace.array("lattice", 6 * n), _workspace.array("lattice_features", threads, 4 * n + 168)
     from_anchor(grid, _array(lattice), x)
     side = round(len(lattice) ** (1 / 3))
     flat = (_array(table).reshape(-1), x, side, gradient.numpy().reshape(-1))
