@@ -26,6 +26,8 @@ from ._cpu_simd import (
 from ._cpu_table import scatter_add
 from ._cpu_tile import COLUMNS, ROWS, make_tile
 
+TABLE_SCRATCH = 2 * 64 + 40
+
 tile_set = make_tile(False, False)
 tile_add = make_tile(True, False)
 
@@ -164,13 +166,14 @@ def next_level(counter, grid, d_table):
 
 
 @njit(**INNER)
-def table_back(grid, level, x, d_enc, at_a, n, pitch, rows, parts, d_table):
+def table_back(grid, level, x, d_enc, at_a, n, pitch, scratch, d_table):
     """Add one level's rows of the table gradient from a chunk of points: x [6, pitch], d_enc [features, pitch], the
     level's two from ``at_a`` on.
 
     Neighbours on a ray often share a cell: their sums stay in registers, one lane per corner, until the cell changes.
-    rows: int32 [2, 64] and parts: float32 [40] are scratch.
+    scratch: float32 [TABLE_SCRATCH], the corners of two times eight cells and what is known of the later eight points.
     """
+    rows, parts = scratch[:128].view(np.int32), scratch[128:]
     zero = splat(np.float32(0))
     ux, uy, uz = lanes(-1, 1, -1, 1, -1, 1, -1, 1), lanes(-1, -1, 1, 1, -1, -1, 1, 1), lanes(-1, -1, -1, -1, 1, 1, 1, 1)
     bx, by, bz = lanes(1, 0, 1, 0, 1, 0, 1, 0), lanes(1, 1, 0, 0, 1, 1, 0, 0), lanes(1, 1, 1, 1, 0, 0, 0, 0)

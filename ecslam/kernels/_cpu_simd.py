@@ -1,7 +1,7 @@
-"""Eight-lane vectors for numba: numbers of type ``f32x8`` and ``i32x8`` that jitted code can load, combine and store.
+"""Vectors for numba: numbers of type ``f32x8``, ``i32x8`` and ``f32x16`` that jitted code can load, combine and store.
 
-numba leaves vectorising to LLVM's heuristics; these types state it. They lower to LLVM vectors, which the compiler maps
-to one AVX register, two SSE or NEON registers, or half an AVX-512 one.
+numba leaves vectorising to LLVM's heuristics; these types state it. They lower to LLVM vectors. Eight lanes are one AVX
+register or two of SSE or NEON, sixteen are one of AVX-512 or two of AVX.
 """
 
 from __future__ import annotations

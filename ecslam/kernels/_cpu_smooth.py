@@ -49,10 +49,10 @@ def from_anchor(grid, points, x):
 
 @njit(**WORKER)
 def smooth_worker(t, counter, scratch, grid, table, x, side, d_table):
-    """Gradient of the whole table; scratch: float32 [threads, 4 n + 168]."""
+    """Gradient of the whole table; scratch: float32 [threads, 4 n + 64 + TABLE_SCRATCH]."""
     n = x.shape[0] // 6
     feature, d_feature, rest = scratch[t, : 2 * n], scratch[t, 2 * n : 4 * n], scratch[t, 4 * n :]
-    rows, parts = rest[:128].view(np.int32), rest[128:]
+    rows, rest = rest[:64].view(np.int32), rest[64:]
     while True:
         level = next_level(counter, grid, d_table)
         if level < 0:
@@ -61,4 +61,4 @@ def smooth_worker(t, counter, scratch, grid, table, x, side, d_table):
         d_feature[:] = 0
         for k in range(2):
             differences_back(feature, side, k * n, d_feature)
-        table_back(grid, level, x, d_feature, 0, n, n, rows, parts, d_table)
+        table_back(grid, level, x, d_feature, 0, n, n, rest, d_table)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ._cpu_back import features_back, hidden_back, next_level, points_back, table_back, weights_back
+from ._cpu_back import TABLE_SCRATCH, features_back, hidden_back, next_level, points_back, table_back, weights_back
 from ._cpu_field import BLOCK, carve, forward
 from ._cpu_math import BOTH, HALF, INNER, OUTER, PART, WORKER
 from ._cpu_rays import compare, composite, pose_sums, rendered, sample_points
@@ -257,7 +257,7 @@ def table_worker(t, counter, kept, buffers, chunk_rays, grid, padded, total, sam
     """Gradient of the whole table from what ``step_loop`` kept: a level belongs to one thread at a time."""
     pitch = up_to_eight(chunk_rays * samples)
     chunks = (total + chunk_rays - 1) // chunk_rays
-    rows, parts = buffers[t, :128].view(np.int32), buffers[t, 128:168]
+    scratch = buffers[t, :TABLE_SCRATCH]
     while True:
         level = next_level(counter, grid, d_table)
         if level < 0:
@@ -265,7 +265,7 @@ def table_worker(t, counter, kept, buffers, chunk_rays, grid, padded, total, sam
         for chunk in range(chunks):
             n = up_to_eight(min(chunk_rays, total - chunk * chunk_rays) * samples)
             x, d_enc = kept[chunk, : 6 * pitch], kept[chunk, 6 * pitch :]
-            table_back(grid, level, x, d_enc, 2 * level * pitch, n, pitch, rows, parts, d_table)
+            table_back(grid, level, x, d_enc, 2 * level * pitch, n, pitch, scratch, d_table)
 
 
 @njit(**OUTER)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..compiled import drop_stale
+from ._cpu_back import TABLE_SCRATCH
 from ._cpu_field import Grid, Net, scratch_floats
 from ._cpu_math import BOTH, HALF
 from ._cpu_poses import pose_worker
@@ -285,7 +286,8 @@ def smoothness(layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:
     """See ``reference.smoothness``."""
     n = (len(lattice) + 7) // 8 * 8
     grid, gradient, threads = _grid(layout), torch.empty_like(table), torch.get_num_threads()
-    x, scratch = _workspace.array("lattice", 6 * n), _workspace.array("lattice_features", threads, 4 * n + 168)
+    x = _workspace.array("lattice", 6 * n)
+    scratch = _workspace.array("lattice_features", threads, 4 * n + 64 + TABLE_SCRATCH)
     from_anchor(grid, _array(lattice), x)
     side = round(len(lattice) ** (1 / 3))
     flat = (_array(table).reshape(-1), x, side, gradient.numpy().reshape(-1))
