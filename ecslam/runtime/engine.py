@@ -35,7 +35,7 @@ CHECKPOINT_EVERY = 5
 WATCHED_PERIOD_S, UNWATCHED_PERIOD_S = 1 / 30, 1 / 4
 LONG_STEP_S = 0.5
 PATIENCE_S = 5.0
-PREPARING = "Preparing: the first run on a machine compiles its kernels, which takes up to half a minute"
+PREPARING = "Preparing: the first run on a machine compiles its kernels, which takes about a minute"
 
 Items = Iterator[tuple[int, Frame | FrameError]]
 
