@@ -98,62 +98,64 @@ def emit_pointer(context, builder, kind, array, index, element):
 
 
 def emit_call(builder, name, *args):
-    kind = ir.FunctionType(FLOATS, [FLOATS] * len(args))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{LANES}f32"), args)
+    vector = args[0].type
+    kind = ir.FunctionType(vector, [vector] * len(args))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{vector.count}f32"), args)
+
+
+def _splats(number, vector):
+    """How to make a vector of a number that is cast first."""
+
+    def generate(context, builder, signature, args):
+        return emit_splat(builder, context.cast(builder, args[0], signature.args[0], number), vector)
+
+    return generate
+
+
+def _loads(vector):
+    """How to read a vector from an array at an index."""
+
+    def generate(context, builder, signature, args):
+        array, index = signature.args
+        at = context.cast(builder, args[1], index, types.intp)
+        return builder.load(emit_pointer(context, builder, array, args[0], at, vector), align=4)
+
+    return generate
+
+
+def _bits(builder, truth):
+    """Eight truth values as an int64, the first the lowest bit."""
+    return builder.zext(builder.bitcast(truth, ir.IntType(LANES)), ir.IntType(64))
 
 
 @intrinsic
 def splat(typing, value):
     """The float ``value`` in every lane."""
-
-    def generate(context, builder, signature, args):
-        return emit_splat(builder, context.cast(builder, args[0], value, types.float32), FLOATS)
-
-    return f32x8(value), generate
+    return f32x8(value), _splats(types.float32, FLOATS)
 
 
 @intrinsic
 def splat16(typing, value):
     """The float ``value`` in every lane of sixteen."""
-
-    def generate(context, builder, signature, args):
-        return emit_splat(builder, context.cast(builder, args[0], value, types.float32), WIDE)
-
-    return f32x16(value), generate
+    return f32x16(value), _splats(types.float32, WIDE)
 
 
 @intrinsic
 def isplat(typing, value):
     """The integer ``value`` in every lane."""
-
-    def generate(context, builder, signature, args):
-        return emit_splat(builder, context.cast(builder, args[0], value, types.int32), INTS)
-
-    return i32x8(value), generate
+    return i32x8(value), _splats(types.int32, INTS)
 
 
 @intrinsic
 def load(typing, array, index):
-    """Lanes array[index : index + 8] of a contiguous one-dimensional float32 or int32 array."""
-    kind = f32x8 if array.dtype == types.float32 else i32x8
-
-    def generate(context, builder, signature, args):
-        index = context.cast(builder, args[1], signature.args[1], types.intp)
-        element = FLOATS if kind == f32x8 else INTS
-        return builder.load(emit_pointer(context, builder, array, args[0], index, element), align=4)
-
-    return kind(array, index), generate
+    """Lanes array[index : index + 8] of a contiguous one-dimensional float32 array."""
+    return f32x8(array, index), _loads(FLOATS)
 
 
 @intrinsic
 def load16(typing, array, index):
     """Lanes array[index : index + 16] of a contiguous one-dimensional float32 array."""
-
-    def generate(context, builder, signature, args):
-        index = context.cast(builder, args[1], signature.args[1], types.intp)
-        return builder.load(emit_pointer(context, builder, array, args[0], index, WIDE), align=4)
-
-    return f32x16(array, index), generate
+    return f32x16(array, index), _loads(WIDE)
 
 
 @intrinsic
@@ -297,15 +299,13 @@ def row_sums(typing, a, b, c, d, e, f, g, h):
 def transpose(typing, source, at, stride, target, to, pitch):
     """target[to + j * pitch + i] = source[at + i * stride + j] for i, j in 0..7."""
 
-    element = FLOATS if source.dtype == types.float32 else INTS
-
     def generate(context, builder, signature, args):
         kinds = signature.args
         at, stride, to, pitch = (context.cast(builder, args[i], kinds[i], types.intp) for i in (1, 2, 4, 5))
 
         def place(kind, array, start, step, i):
             index = builder.add(start, builder.mul(step, ir.Constant(step.type, i)))
-            return emit_pointer(context, builder, kind, array, index, element)
+            return emit_pointer(context, builder, kind, array, index, FLOATS)
 
         rows = [builder.load(place(source, args[0], at, stride, i), align=4) for i in range(LANES)]
         for even, odd, step in STAGES:
@@ -333,8 +333,7 @@ def same_bits(typing, a, b):
     """Bit i is set where lane i of two integer vectors is equal."""
 
     def generate(context, builder, signature, args):
-        mask = builder.bitcast(builder.icmp_signed("==", *args), ir.IntType(LANES))
-        return builder.zext(mask, ir.IntType(64))
+        return _bits(builder, builder.icmp_signed("==", *args))
 
     return types.int64(a, b), generate
 
@@ -344,9 +343,7 @@ def zero_bits(typing, a):
     """Bit i is set where lane i is zero."""
 
     def generate(context, builder, signature, args):
-        zero = ir.Constant(FLOATS, [0.0] * LANES)
-        mask = builder.bitcast(builder.fcmp_ordered("==", args[0], zero), ir.IntType(LANES))
-        return builder.zext(mask, ir.IntType(64))
+        return _bits(builder, builder.fcmp_ordered("==", args[0], ir.Constant(FLOATS, [0.0] * LANES)))
 
     return types.int64(a), generate
 

@@ -49,10 +49,10 @@ def from_anchor(grid, points, x):
 
 @njit(**WORKER)
 def smooth_worker(t, counter, scratch, grid, table, x, side, d_table):
-    """Gradient of the whole table; scratch: float32 [threads, 4 n + 64 + TABLE_SCRATCH]."""
+    """Gradient of the whole table; scratch: float32 [threads, 4 n + TABLE_SCRATCH]."""
     n = x.shape[0] // 6
     feature, d_feature, rest = scratch[t, : 2 * n], scratch[t, 2 * n : 4 * n], scratch[t, 4 * n :]
-    rows, rest = rest[:64].view(np.int32), rest[64:]
+    rows = rest[:64].view(np.int32)  # read before ``table_back`` writes there
     while True:
         level = next_level(counter, grid, d_table)
         if level < 0:

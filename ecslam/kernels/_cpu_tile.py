@@ -7,7 +7,7 @@ from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ._cpu_simd import FLOAT, INT, emit_pointer
+from ._cpu_simd import FLOAT, emit_call, emit_pointer, emit_splat
 
 
 def _has(feature):
@@ -60,10 +60,10 @@ def make_tile(accumulate, relu):
                     for j in range(VECTORS)
                 ]
                 for i in range(ROWS):
-                    left = _splat(builder, builder.load(at(a, args[3], FLOAT, a0, ar, i, ak, k)))
+                    left = emit_splat(builder, builder.load(at(a, args[3], FLOAT, a0, ar, i, ak, k)), FLOATS)
                     for j in range(VECTORS):
                         total = sums[i * VECTORS + j]
-                        builder.store(_fma(builder, left, right[j], builder.load(total)), total)
+                        builder.store(emit_call(builder, "llvm.fmuladd", left, right[j], builder.load(total)), total)
             for place, total in zip(places, sums, strict=True):
                 value = builder.load(total)
                 if relu:
@@ -74,14 +74,3 @@ def make_tile(accumulate, relu):
         return types.void(c, c0, cr, a, a0, ar, ak, b, b0, bk, n), generate
 
     return tile
-
-
-def _splat(builder, value):
-    one = builder.insert_element(ir.Constant(FLOATS, ir.Undefined), value, INT(0))
-    order = ir.Constant(ir.VectorType(INT, LANES), [0] * LANES)
-    return builder.shuffle_vector(one, ir.Constant(FLOATS, ir.Undefined), order)
-
-
-def _fma(builder, a, b, c):
-    kind = ir.FunctionType(FLOATS, [FLOATS] * 3)
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{LANES}f32"), [a, b, c])

@@ -207,7 +207,7 @@ def step_worker(
 ):
     """One step up to the decoders: losses [groups, 5], decoder gradients partial [groups, size] and ray sums [R, 6].
 
-    Leaves each chunk's positions and feature gradients in ``kept`` for ``table_loop`` if parameters are wanted.
+    Leaves each chunk's positions and feature gradients in ``kept`` for ``table_worker`` if parameters are wanted.
     """
     samples = rays.z.shape[1]
     total = rays.z.shape[0]
@@ -254,7 +254,7 @@ def backward(grid, net, s, n, pitch, want_params, want_poses, own, a, b):
 
 @njit(**WORKER)
 def table_worker(t, counter, kept, buffers, chunk_rays, grid, padded, total, samples, d_table):
-    """Gradient of the whole table from what ``step_loop`` kept: a level belongs to one thread at a time."""
+    """Gradient of the whole table from what ``step_worker`` kept: a level belongs to one thread at a time."""
     pitch = up_to_eight(chunk_rays * samples)
     chunks = (total + chunk_rays - 1) // chunk_rays
     scratch = buffers[t, :TABLE_SCRATCH]

@@ -287,7 +287,7 @@ def smoothness(layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:
     n = (len(lattice) + 7) // 8 * 8
     grid, gradient, threads = _grid(layout), torch.empty_like(table), torch.get_num_threads()
     x = _workspace.array("lattice", 6 * n)
-    scratch = _workspace.array("lattice_features", threads, 4 * n + 64 + TABLE_SCRATCH)
+    scratch = _workspace.array("lattice_features", threads, 4 * n + TABLE_SCRATCH)
     from_anchor(grid, _array(lattice), x)
     side = round(len(lattice) ** (1 / 3))
     flat = (_array(table).reshape(-1), x, side, gradient.numpy().reshape(-1))
