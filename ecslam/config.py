@@ -159,13 +159,17 @@ class WindowConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything a run depends on besides the sequence. Defaults are the paper's lite preset on Replica."""
+    """Everything a run depends on besides the sequence. Defaults are the paper's lite preset on Replica.
+
+    deskew: whether the motion during a rolling shutter is taken out (ours, see ``shutter``).
+    """
 
     preset: str = "lite"
     seed: int = _number(0, 0, 2**31 - 1)
     schedule: Literal["strict", "overlap"] = "strict"
     fus: bool = True
     eba: bool = True
+    deskew: bool = True
     truncation_m: float = _number(0.06, 1e-3, 1.0)
     centre_share: float = _number(0.4, 0.01, 1.0)
     depth_near_m: float = _number(0.1, 0.0, 10.0)

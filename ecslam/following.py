@@ -16,10 +16,11 @@ from .kernels.graphs import Recorder
 from .keyframes import Keyframe
 from .observed import ObservedVoxels
 from .observed_gpu import ObservedTable
-from .recovery import Recovery, around, best_start
+from .recovery import SUDDEN_DEG, SUDDEN_M, Recovery, around, best_start, near
 from .relocalisation import Relocalisation
 from .samples import seeded
 from .saving import Arrays, part, prefixed
+from .shutter import STILL, Sweep, sweep_between
 from .tracker import HostTracker, Tracker, TrackResult
 from .trajectory import Trajectory
 from .types import Frame, Intrinsics
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from .tracker_gpu import GpuTracker
 
 GAP_S = 1.0
+SWEEP_OVER = 2  # frames: with fewer, what one is off by moves the next
 
 
 class Follower:
@@ -74,14 +76,25 @@ class Follower:
         surface, tracker = self._tracker(field, config)
         last, gap = trajectory[-1], frame.timestamp - trajectory.timestamps[-1] > GAP_S
         guess = last if self.recovery.lost or gap else trajectory.predict(frame.timestamp)
-        track = best_start(lambda start: tracker.track(frame, start, field, config), around(guess) if gap else [guess])
+        sweep = STILL if self.recovery.lost or gap else self.sweep(trajectory, config)
+        starts = around(guess) if gap else [guess]
+        track = best_start(lambda start: tracker.track(frame, start, field, config, sweep), starts)
         elsewhere = Relocalisation(frame, self._camera, surface, trajectory, keyframes, config, self._rng)
         return self.recovery.judge(track, last, elsewhere, gap)
 
-    def fuse(self, frame: Frame, c2w: NDArray[np.float64], config: Config) -> None:
-        """Average a frame seen from c2w [4, 4] into the volume, where there is one."""
+    def sweep(self, trajectory: Trajectory, config: Config) -> Sweep:
+        """How the camera moves while an image is read, if it moves as in the last frames of ``trajectory`` (see
+        ``shutter``); not at all where these are too far apart to tell, as after it was found again."""
+        over = min(SWEEP_OVER, len(trajectory) - 1)
+        before, last = trajectory[-1 - over], trajectory[-1]
+        if not config.deskew or not near(before, last, over * SUDDEN_M, over * SUDDEN_DEG):
+            return STILL
+        return sweep_between(before, last, trajectory.timestamps[-1] - trajectory.timestamps[-1 - over], self._camera)
+
+    def fuse(self, frame: Frame, c2w: NDArray[np.float64], sweep: Sweep, config: Config) -> None:
+        """Average a frame seen from c2w [4, 4] during ``sweep`` into the volume, where there is one."""
         if self._volume is not None:
-            self._volume.integrate(frame, self._camera, c2w, config.depth_near_m, config.depth_far_m)
+            self._volume.integrate(frame, self._camera, c2w, config.depth_near_m, config.depth_far_m, sweep)
 
     def trust(self, count: int) -> None:
         """From now on the map may be trusted where the first ``count`` keyframes saw something."""

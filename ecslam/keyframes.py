@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .config import Config
 from .landmarks import KEPT, LANDMARK_BYTES, Landmarks, find_landmarks
 from .pixels import Pixels, choose_pixels
+from .shutter import Sweep, straight, straight_pixels
 from .types import Frame, Intrinsics
 
 THUMBNAIL = (40, 30)
@@ -38,6 +39,14 @@ class Keyframe:
         known = (head, thumbnail, landmarks.points, landmarks.descriptors)
         parts = (*known, pixels.direction, pixels.depth, pixels.color, pixels.feature)
         return cls(frame, np.concatenate([part.ravel().view(np.uint8) for part in parts]))
+
+    def straight(self, camera: Intrinsics, sweep: Sweep) -> Keyframe:
+        """The same keyframe as seen halfway through a ``sweep`` (see ``shutter``)."""
+        if not sweep.any():
+            return self
+        known = self.landmarks
+        landmarks = replace(known, points=straight(known.points, camera, sweep))
+        return Keyframe.of(self.frame, straight_pixels(self.pixels, camera, sweep), self.thumbnail, landmarks)
 
     def __len__(self) -> int:
         """How many pixels are stored."""

@@ -15,6 +15,7 @@ from .kernels.tracking_gpu import Cells, Lens, Marks
 from .observed import LEAST_KNOWN, VOXEL_M
 from .observed_gpu import ObservedTable
 from .pixels import LUMINANCE, border_of, feature_points, grid_shape
+from .shutter import FAR_M
 from .types import Frame, Intrinsics
 
 
@@ -78,6 +79,23 @@ def choose(
         frame.color, frame.depth, jitter, corners, order if config.fus else None, cells, _lens(camera, config),
         Marks(observed.marks.view(torch.uint8), len(observed.marks), 1 / VOXEL_M), c2w, LEAST_KNOWN,
     )  # fmt: skip
+
+
+def straight(points: Tensor, camera: Intrinsics, sweep: Tensor) -> Tensor:
+    """``shutter.straight`` of points [N, 3 or 4], the fourth number left alone; 0 stays 0. sweep: [6]."""
+    at, rest = points[:, :3], points[:, 3:]
+    there = at[:, 2:] > 0
+    share = (camera.fy * at[:, 1:2] / torch.where(there, at[:, 2:], 1.0) + camera.cy + 0.5) / camera.height - 0.5
+    move = sweep[:3] + torch.linalg.cross(sweep[3:].expand_as(at), at)
+    return torch.cat([at + share * move * there, rest], 1)
+
+
+def straight_pixels(pixels: DevicePixels, camera: Intrinsics, sweep: Tensor) -> DevicePixels:
+    """See ``shutter.straight_pixels``."""
+    there = pixels.depth > 0
+    points = straight(pixels.direction * torch.where(there, pixels.depth, FAR_M)[:, None], camera, sweep)
+    z = points[:, 2]
+    return pixels._replace(direction=points / z[:, None], depth=torch.where(there, z, 0.0))
 
 
 def _lens(camera: Intrinsics, config: Config) -> Lens:

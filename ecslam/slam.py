@@ -29,6 +29,7 @@ from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .scene_box import SceneBox
+from .shutter import STILL
 from .trajectory import Trajectory
 from .types import Frame, FrameError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
@@ -107,12 +108,13 @@ class Slam:
         index, recovery = len(self.trajectory), self._follower.recovery
         keyframe = index % self.config.keyframe_every == 0 and not recovery.missed
         self.trajectory.append(track.c2w, frame.timestamp, keyframe)
+        sweep = self._follower.sweep(self.trajectory, self.config)
         if not recovery.missed:
-            self._follower.fuse(frame, self.trajectory[-1], self.config)
+            self._follower.fuse(frame, self.trajectory[-1], sweep, self.config)
         tracked, loop, waited_s = time.perf_counter(), None, 0.0
         if keyframe:
             keyframe_now = make_keyframe(frame, self.intrinsics, self.config)
-            self.keyframes.append(self._shelf.keep(keyframe_now))
+            self.keyframes.append(self._shelf.keep(keyframe_now.straight(self.intrinsics, sweep)))
         if keyframe and self._mapping_is_due():
             waited_s = self._apply_pending(block=True)
             loop = self._map(frame.index, interrupt)
@@ -154,7 +156,7 @@ class Slam:
             raise
         self._apply(mapped)
         self._landed = Landed()
-        self._follower.fuse(frame, self.trajectory[-1], self.config)
+        self._follower.fuse(frame, self.trajectory[-1], STILL, self.config)
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,

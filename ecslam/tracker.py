@@ -21,6 +21,7 @@ from .pixels import Pixels, choose_pixels, spread_pixels
 from .pose_adam import PoseAdam, pose_rates
 from .rays import kernel_weights, make_rays, upload, view_centre
 from .samples import resample_missing, seeded, uniform
+from .shutter import STILL, Sweep, straight_pixels
 from .types import Frame, Intrinsics
 
 LEAST_SEEN = 0.1
@@ -40,9 +41,16 @@ class TrackResult:
 class Tracker(Protocol):
     """Follows the camera from frame to frame."""
 
-    def track(self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config) -> TrackResult:
-        """The pose of a frame, sought from ``guess`` [4, 4]; ``guess`` itself with a fit of 0 where hardly anything is
-        measured."""
+    def track(
+        self,
+        frame: Frame,
+        guess: NDArray[np.float64],
+        field: TsdfField,
+        config: Config,
+        sweep: Sweep = STILL,
+    ) -> TrackResult:
+        """The pose of a frame, sought from ``guess`` [4, 4], that was read during ``sweep`` (see ``shutter``);
+        ``guess`` itself with a fit of 0 where hardly anything is measured."""
         ...
 
 
@@ -60,10 +68,18 @@ class HostTracker:
     generator: torch.Generator | None
     recorder: Recorder
 
-    def track(self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config) -> TrackResult:
+    def track(
+        self,
+        frame: Frame,
+        guess: NDArray[np.float64],
+        field: TsdfField,
+        config: Config,
+        sweep: Sweep = STILL,
+    ) -> TrackResult:
         """See ``Tracker``. Direct alignment of points spread over the image, then the paper's rendered tracking; the
         preset may leave either out. A rendered pose that costs more on the aligned surface is not taken."""
         surface, measured = self.surface, spread_pixels(frame, self.camera, config.align.points, config, self.rng)
+        measured = straight_pixels(measured, self.camera, sweep)
         if len(measured.points()) < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
         c2w, losses = guess, {}
@@ -73,6 +89,7 @@ class HostTracker:
             c2w, losses = found.c2w, {"align_mm": 1e3 * found.cost**0.5}
         if config.tracking.iterations > 0:
             pixels = choose_pixels(frame, self.camera, config.tracking.rays, config, self.rng)
+            pixels = straight_pixels(pixels, self.camera, sweep)
             pixels = self.observed.known(pixels, c2w, same_count=field.device.type != "cpu")
             generator = self.generator or seeded(self.rng, field.device)
             rendered, losses = track_adam(field, self.kernels, pixels, c2w, config, generator, self.recorder)

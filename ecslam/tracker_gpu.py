@@ -24,10 +24,11 @@ from .kernels._gpu_descent import COUNT
 from .kernels.graphs import Recorder
 from .kernels.tracking_gpu import TOLD
 from .observed_gpu import ObservedTable
-from .pixels_gpu import DeviceFrame, choose, grid_cells, padded_corners, spread
+from .pixels_gpu import DeviceFrame, choose, grid_cells, padded_corners, spread, straight, straight_pixels
 from .pose_adam import pose_rates
 from .rays import kernel_weights, make_rays
 from .samples import uniform
+from .shutter import STILL, Sweep
 from .tracker import LEAST_POINTS, LEAST_SEEN, TrackResult, descend_rendered
 from .types import Frame, Intrinsics
 from .volume_gpu import GpuVolume
@@ -45,18 +46,26 @@ class GpuTracker:
     generator: torch.Generator
     recorder: Recorder
 
-    def track(self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config) -> TrackResult:
-        """The pose of a frame, sought from ``guess`` [4, 4]."""
+    def track(
+        self,
+        frame: Frame,
+        guess: NDArray[np.float64],
+        field: TsdfField,
+        config: Config,
+        sweep: Sweep = STILL,
+    ) -> TrackResult:
+        """See ``Tracker``."""
         device, shown = field.device, self.volume.show(frame)
         a, t, s = config.align, config.tracking, config.sampling
         points, rays = grid_cells(shown, a.points, config), t.rays if t.iterations else 0
         numbers = uniform(self.generator, device, 2 * points + rays * (3 + s.uniform + s.near_depth))
         corners = torch.from_numpy(padded_corners(frame, config, rays)).to(device, non_blocking=True)
         start = torch.from_numpy(guess).to(device, non_blocking=True)
+        swept = torch.from_numpy(sweep.astype(np.float32)).to(device, non_blocking=True)
         order = _shuffled(grid_cells(shown, rays, config) if rays else 0, device)
         rates = _rates(t.lr_rotation, t.lr_translation, device)
         over = field, self.volume.blocks, config, shown, order, rates
-        (found,) = self.recorder(partial(self._whole, *over), corners, start, numbers, key=None, over=over)
+        (found,) = self.recorder(partial(self._whole, *over), corners, start, swept, numbers, key=None, over=over)
         pose, (cost, fit, usable), terms = np.split(found.cpu().numpy(), [12, TOLD])
         if usable < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
@@ -73,12 +82,15 @@ class GpuTracker:
         rates: Tensor,
         corners: Tensor,
         start: Tensor,
+        sweep: Tensor,
         numbers: Tensor,
     ) -> tuple[Tensor]:
         """Everything as a function of tensors: float64 [TOLD, and the loss terms where frames are rendered]."""
         a, settings = config.align, tuple(stages(config))
         cells = grid_cells(frame, a.points, config)
         points = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2))
+        rolling = self.camera.readout_s > 0 and config.deskew
+        points = straight(points, self.camera, sweep) if rolling else points
         packed, first = tracking_gpu.packed(blocks, points, start, LEAST_KNOWN)
         row = fusion_gpu.descend(blocks, packed, first, settings, a.iterations, COARSE_STRIDE, RULES)
         pose, terms = row, start.new_empty(0)
@@ -86,6 +98,7 @@ class GpuTracker:
             aligned, cost = fusion_gpu.unpack_pose(row)
             jitter = numbers[2 * cells :].view(config.tracking.rays, -1)
             pixels = choose(frame, self.camera, config, corners, order, jitter[:, :3], self.observed, aligned)
+            pixels = straight_pixels(pixels, self.camera, sweep) if rolling else pixels
             rendered, terms = self._rendered(field, config, pixels, aligned, rates, jitter[:, 3:])
             worse = _objective(blocks, packed, rendered, row[COUNT.value], settings[-1]) > cost
             pose = torch.where(worse, aligned, rendered)

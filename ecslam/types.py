@@ -33,7 +33,8 @@ class Intrinsics:
     """Pinhole camera, OpenCV convention (x right, y down, z forward); all values in pixels.
 
     ``distortion`` holds OpenCV's (k1, k2, p1, p2[, k3]) and is empty for an ideal pinhole. A ``Sequence`` returns
-    images that are already undistorted, so the engine never looks at it.
+    images that are already undistorted, so the engine never looks at it. ``readout_s``: seconds from the first row to
+    the last where depth is read row by row (a rolling shutter), 0 where all of it is seen at once.
     """
 
     fx: float
@@ -43,6 +44,7 @@ class Intrinsics:
     width: int
     height: int
     distortion: tuple[float, ...] = ()
+    readout_s: float = 0.0
 
     def matrix(self) -> NDArray[np.float64]:
         """The 3x3 calibration matrix K."""
@@ -59,6 +61,7 @@ class Intrinsics:
             width,
             height,
             self.distortion,
+            self.readout_s,
         )
 
 

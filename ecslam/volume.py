@@ -18,6 +18,7 @@ from .descent import COARSE_STRIDE, RULES, Alignment
 from .kernels import AlignSettings, NormalEquations, fusion, fusion_descent
 from .kernels.graphs import Recorder
 from .pixels import Points
+from .shutter import STILL, Sweep
 from .types import Frame, Intrinsics
 
 if TYPE_CHECKING:
@@ -39,9 +40,16 @@ class FusedVolume:
         self._now = 0
 
     def integrate(
-        self, frame: Frame, camera: Intrinsics, c2w: NDArray[np.float64], near_m: float, far_m: float
+        self,
+        frame: Frame,
+        camera: Intrinsics,
+        c2w: NDArray[np.float64],
+        near_m: float,
+        far_m: float,
+        sweep: Sweep = STILL,
     ) -> None:
-        """Average a frame seen from c2w [4, 4] into the volume; depth outside near..far counts as none."""
+        """Average a frame seen from c2w [4, 4] during ``sweep`` (see ``shutter``) into the volume; depth outside
+        near..far counts as none."""
         depth = np.where((frame.depth >= near_m) & (frame.depth <= far_m), frame.depth, np.float32(0))
         light = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1 / 255)
         numbers = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
@@ -49,7 +57,7 @@ class FusedVolume:
         normal = np.empty((-(-depth.shape[0] // step), -(-depth.shape[1] // step), 3), np.float32)
         edges = np.linspace(0, len(normal), threads + 1).astype(int)
         parts = [_pool().submit(fusion.normals, depth, numbers, normal, *rows) for rows in pairwise(edges)]
-        view = fusion.View(depth, light, normal, numbers, np.ascontiguousarray(c2w))
+        view = fusion.View(depth, light, normal, numbers, np.ascontiguousarray(c2w), tuple(sweep.tolist()))
         listed = self._touch(view)
         _wait(parts)
         halves = np.array_split(listed, threads)

@@ -16,6 +16,7 @@ from .kernels.fusion import EDGE
 from .kernels.graphs import Recorder
 from .pixels import Points
 from .pixels_gpu import DeviceFrame
+from .shutter import STILL, Sweep
 from .types import Frame, Intrinsics
 from .volume import STRIDE
 
@@ -49,12 +50,19 @@ class GpuVolume:
         return int(self._listed.counts[1])
 
     def integrate(
-        self, frame: Frame, camera: Intrinsics, c2w: NDArray[np.float64], near_m: float, far_m: float
+        self,
+        frame: Frame,
+        camera: Intrinsics,
+        c2w: NDArray[np.float64],
+        near_m: float,
+        far_m: float,
+        sweep: Sweep = STILL,
     ) -> None:
         """See ``FusedVolume.integrate``. A block that finds no place in the table is left to a later frame."""
         self._grow_in_time()
         self._now += 1
-        numbers = [*c2w[:3].flat, camera.fx, camera.fy, camera.cx, camera.cy, near_m, far_m, self._now]
+        lens = camera.fx, camera.fy, camera.cx, camera.cy
+        numbers = [*c2w[:3].flat, *lens, near_m, far_m, self._now, *sweep]
         steps = int(np.ceil(2 * self.truncation_m / (0.5 * EDGE * self.voxel_m))) + 1
         blocks, listed, shown = self.blocks, self._listed, self.show(frame)
 

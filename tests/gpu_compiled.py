@@ -71,7 +71,7 @@ def launch_the_volume():
     """Everything that ``fusion_gpu`` and ``tracking_gpu`` launch."""
     blocks, listed = fusion_gpu.allocate(1 << 12, 0.02, 0.06, torch.device("cpu"))
     start, points = fusion_gpu.pack_start(torch.eye(4), 2000), torch.zeros(2048, 4)
-    depth, color, numbers = torch.zeros(480, 640), torch.zeros(480, 640, 3, dtype=torch.uint8), torch.zeros(19).double()
+    depth, color, numbers = torch.zeros(480, 640), torch.zeros(480, 640, 3, dtype=torch.uint8), torch.zeros(25).double()
     fusion_gpu.enter(blocks, listed, torch.zeros(7, dtype=torch.int64))
     fusion_gpu.fuse(blocks, listed, depth, color, numbers, 4, 3)
     fusion_gpu.distances(blocks, torch.zeros(7, 3).double(), torch.eye(4).double())

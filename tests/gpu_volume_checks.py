@@ -12,7 +12,7 @@ import torch
 from fake_graphs import FakeGraphs, Forbidding, launch_nothing
 from kernel_cases import relative_rms
 from on_gpu import DEVICE, INTERPRETED, moved
-from planes import corner, look, pose
+from planes import corner, look, look_row_by_row, pose
 
 from ecslam import volume_gpu
 from ecslam.align import align, known_points, stages
@@ -26,6 +26,9 @@ from ecslam.observed import ObservedVoxels
 from ecslam.observed_gpu import ObservedTable
 from ecslam.pixels import Points, spread_pixels
 from ecslam.pixels_gpu import DeviceFrame, grid_cells
+from ecslam.pixels_gpu import straight_pixels as straight_on_device
+from ecslam.rays import upload
+from ecslam.shutter import STILL, straight_pixels
 from ecslam.tracker import HostTracker
 from ecslam.tracker_gpu import TOLD, GpuTracker
 from ecslam.types import Intrinsics
@@ -34,6 +37,7 @@ from ecslam.volume_gpu import GpuVolume
 
 torch.set_num_threads(1)
 CAMERA = Intrinsics(48.0, 48.0, 23.6, 17.3, 48, 36)
+SWEEP = np.array([0.03, -0.02, 0.04, 0.02, -0.03, 0.01])
 LENGTHS = (0.04, 0.11)  # no voxel of the corner lies exactly a truncation away
 CONFIG = Config(border_px=1, truncation_m=0.11, align=AlignConfig(gradient_range=(0.5, 1.5)))
 POSES = (
@@ -127,6 +131,14 @@ def test_replays_average_in_what_plain_calls_do(pair):
 def test_noise_holes_edges_and_colours(width):
     frames = [frame(c2w, replace(CAMERA, width=width)) for c2w in POSES]
     assert_alike(*both(frames))
+
+
+def test_a_rolling_shutter_is_averaged_in_as_on_the_cpu():
+    volumes = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, DEVICE)
+    for volume in volumes:
+        for c2w in POSES:
+            volume.integrate(look_row_by_row(c2w, SWEEP, corner(), CAMERA), CAMERA, c2w, 0.1, 8.0, SWEEP)
+    assert_alike(*volumes)
 
 
 def test_weights_have_a_limit(pair):
@@ -282,7 +294,7 @@ def test_nothing_waits_for_the_host(monkeypatch):
     points, start = torch.zeros(64, 4, device="meta"), fusion_gpu.pack_start(torch.eye(4), 50).to("meta")
     depth, color = torch.zeros(36, 48, device="meta"), torch.zeros(36, 48, 3, dtype=torch.uint8, device="meta")
     with Forbidding():
-        fusion_gpu.fuse(blocks, listed, depth, color, torch.zeros(19, device="meta"), 4, 3)
+        fusion_gpu.fuse(blocks, listed, depth, color, torch.zeros(25, device="meta"), 4, 3)
         row = fusion_gpu.descend(blocks, points, start, tuple(stages(CONFIG)), 10, 4, RULES)
     assert row.shape == start.shape
 
@@ -314,6 +326,31 @@ def test_a_frame_is_tracked_as_on_the_host(pair):
             np.testing.assert_allclose(found.c2w, TRUE, atol=4e-3)
             assert found.fit > 0.95
             assert 0 < found.losses["align_mm"] < 5
+
+
+@pytest.mark.parametrize("rays", [0, 60])
+def test_a_rolling_shutter_is_straightened_as_on_the_host(pair, rays):
+    seen = look_row_by_row(TRUE, SWEEP, corner(), CAMERA)
+    tracking = TrackingConfig(iterations=min(rays, 2), rays=60, lr_rotation=1e-5, lr_translation=1e-5)
+    off = []
+    for tracker, field in trackers(pair):
+        rolling = replace(tracker, camera=replace(CAMERA, readout_s=0.03))
+        found = rolling.track(seen, GUESS, field, replace(TINY, tracking=tracking), SWEEP)
+        np.testing.assert_allclose(found.c2w, TRUE, atol=4e-3)
+        skewed = rolling.track(seen, GUESS, field, replace(TINY, tracking=tracking), STILL)
+        off.append([np.abs(each.c2w - TRUE).max() for each in (found, skewed)])
+    assert all(found < 0.5 * skewed for found, skewed in off)
+
+
+def test_pixels_are_straightened_as_on_the_host():
+    seen = look_row_by_row(TRUE, SWEEP, corner(), CAMERA)
+    pixels = spread_pixels(seen, CAMERA, 300, CONFIG, np.random.default_rng(0))
+    pixels.depth[::4] = 0
+    mine = straight_on_device(upload(pixels, DEVICE), CAMERA, torch.tensor(SWEEP, dtype=torch.float32, device=DEVICE))
+    theirs = straight_pixels(pixels, CAMERA, SWEEP)
+    np.testing.assert_allclose(mine.direction[:, :2].cpu(), theirs.direction, atol=1e-5)
+    np.testing.assert_allclose(mine.depth.cpu(), theirs.depth, atol=1e-5)
+    assert (mine.direction[:, 2] == 1).all()
 
 
 def test_a_replay_sees_the_newest_frame(pair):
@@ -365,7 +402,8 @@ def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     numbers = torch.zeros(2 * cells + 60 * (3 + 7), device=meta)
     corners, order = (torch.zeros(n, dtype=torch.int64, device=meta) for n in (20 if fus else 0, order))
     start, rates = (torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((4, 4), (1, 6)))
-    given = field, blocks, config, shown, order, rates, corners, start, numbers
+    sweep = torch.zeros(6, device=meta)
+    given = field, blocks, config, shown, order, rates, corners, start, sweep, numbers
     tracker._whole(*given)  # uploads the layout, once
     with Forbidding():
         (found,) = tracker._whole(*given)

@@ -1,5 +1,8 @@
 """What a camera sees of a few planes: exact depth, and a smooth texture fixed in the world."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import torch
 
@@ -24,6 +27,21 @@ def look(c2w, planes, camera=CAMERA):
     light = 0.5 + 0.25 * (np.sin(9 * point[..., 0]) + np.cos(8 * point[..., 1] + 3 * point[..., 2]))
     color = np.repeat((255 * light).round().astype(np.uint8)[..., None], 3, -1)
     return Frame(0, 0.0, color, np.where(hit, depth, 0).astype(np.float32))
+
+
+def look_row_by_row(c2w, sweep, planes, camera=CAMERA):
+    """What a rolling shutter sees that moves by ``sweep`` [6], in its own coordinates, from the first row to the last
+    and is at c2w [4, 4] halfway."""
+    rows = []
+    for v in range(camera.height):
+        motion = np.eye(4)
+        share = (v + 0.5) / camera.height - 0.5
+        motion[:3, :3] = cv2.Rodrigues(share * sweep[3:])[0]
+        motion[:3, 3] = share * sweep[:3]
+        rows.append(look(c2w @ motion, planes, replace(camera, cy=camera.cy - v, height=1)))
+    return replace(
+        rows[0], color=np.concatenate([r.color for r in rows]), depth=np.concatenate([r.depth for r in rows])
+    )
 
 
 def corner():

@@ -23,7 +23,7 @@ LAYERS = (
     ("se3",),
     ("kernels",),
     ("field",),
-    ("pixels", "pixels_gpu", "landmarks", "samples", "rays", "datasets", "observed", "observed_gpu"),
+    ("pixels", "pixels_gpu", "shutter", "landmarks", "samples", "rays", "datasets", "observed", "observed_gpu"),
     ("descent", "volume", "volume_gpu", "scene_box"),
     ("keyframes", "window", "trajectory", "pixel_bank", "draws", "pose_adam", "field_adam", "views", "saving"),
     ("align", "tracker", "tracker_gpu"),

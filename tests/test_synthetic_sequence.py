@@ -198,11 +198,12 @@ def test_address_options():
 @given(
     st.builds(
         Address, st.sampled_from(ROOMS), st.integers(16, 4096), st.integers(16, 4096), st.integers(1, 10**5),
-        st.booleans(), st.integers(0, 10**9),
+        st.booleans(), st.integers(0, 10**9), st.floats(0, 1 / 30),
     )
 )  # fmt: skip
 def test_address_round_trip(a):
     text = f"synthetic/{a.room}?size={a.width}x{a.height}&frames={a.frames}&noise={int(a.noise)}&seed={a.seed}"
+    text += f"&readout={a.readout}"
     assert parse_address(text) == a
 
 
@@ -216,6 +217,9 @@ def test_address_round_trip(a):
         ("synthetic/studio?size=640", "size=WxH"),
         ("synthetic/studio?size=8x8", "out of range"),
         ("synthetic/studio?frames=0", "out of range"),
+        ("synthetic/studio?readout=1", "out of range"),
+        ("synthetic/studio?readout=nan", "out of range"),
+        ("synthetic/studio?readout=30ms", "readout=SECONDS"),
         ("synthetic/studio?seed=-1", "negative"),
     ],
 )

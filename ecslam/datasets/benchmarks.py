@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..types import Intrinsics
 
 ICL_TRUTH = "*.gt.freiburg"
+KINECT_READOUT_S = 0.03  # of the depth of a Kinect v1 or an Xtion
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,10 @@ class Benchmark:
     frames_per_s: float = 0.0
     before: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     after: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+
+
+def _kinect(fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...] = ()) -> Intrinsics:
+    return Intrinsics(fx, fy, cx, cy, 640, 480, distortion, KINECT_READOUT_S)
 
 
 def _rigid(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -58,14 +63,14 @@ ICL = Benchmark(
 )
 KNOWN = {
     FREIBURG.format(1): Benchmark(
-        Intrinsics(517.3, 516.5, 318.6, 255.3, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+        _kinect(517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     ),
     FREIBURG.format(2): Benchmark(
-        Intrinsics(520.9, 521.0, 325.1, 249.7, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172))
+        _kinect(520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     ),
-    FREIBURG.format(3): Benchmark(Intrinsics(535.4, 539.2, 320.1, 247.6, 640, 480)),
+    FREIBURG.format(3): Benchmark(_kinect(535.4, 539.2, 320.1, 247.6)),
     r"rgbd_bonn_": Benchmark(
-        Intrinsics(542.822841, 542.57687, 315.59352, 237.756098, 640, 480, (0.039903, -0.099343, -0.00073, -0.000144)),
+        _kinect(542.822841, 542.57687, 315.59352, 237.756098, (0.039903, -0.099343, -0.00073, -0.000144)),
         before=TO_ROS,
         after=TO_ROS @ _rigid(MARKERS),
     ),

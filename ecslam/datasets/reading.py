@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -89,7 +90,8 @@ def find_intrinsics(
     """
     for folder in folders:
         if (folder / INTRINSICS_FILE).is_file():
-            return read_intrinsics(folder / INTRINSICS_FILE, *size), ()
+            found = read_intrinsics(folder / INTRINSICS_FILE, *size)
+            return default if replace(found, readout_s=default.readout_s) == default else found, ()
     if size == (default.width, default.height):
         return default, ()
     made_for, here = f"{default.width}x{default.height}", f"{size[0]}x{size[1]}"

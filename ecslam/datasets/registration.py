@@ -46,8 +46,8 @@ class Registration:
         """Of the frames: that of depth without distortion, cut to what colour sees as well."""
         rows, columns = self._both
         width, height = columns.stop - columns.start, rows.stop - rows.start
-        k = self.depth
-        return Intrinsics(k.fx, k.fy, k.cx - columns.start, k.cy - rows.start, width, height)
+        k, center = self.depth, (self.depth.cx - columns.start, self.depth.cy - rows.start)
+        return Intrinsics(k.fx, k.fy, *center, width, height, readout_s=k.readout_s * height / k.height)
 
     def registered(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32]

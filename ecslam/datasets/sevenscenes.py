@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..types import InputError, Intrinsics
+from .benchmarks import KINECT_READOUT_S
 from .files import FileSequence
 from .meshes import first_existing
 from .reading import (
@@ -28,7 +29,7 @@ from .reading import (
 from .registration import Registration
 
 COLOR = r"frame-(\d{1,9})\.color\.(?:jpg|png)"
-KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, 640, 480)
+KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, 640, 480, readout_s=KINECT_READOUT_S)
 KINECT_COLOR, KINECT_BASELINE_M = Intrinsics(525.0, 525.0, 320.0, 240.0, 640, 480), 0.025  # redkitchen fits these best
 INFO, INFO_KEY = ("info.txt", "_info.txt"), "m_calibrationDepthIntrinsic"
 FRAMES_PER_S = 30.0

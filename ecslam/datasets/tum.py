@@ -6,6 +6,7 @@ ICL-NUIM's.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import InputError, Intrinsics
-from .benchmarks import ICL_TRUTH, Benchmark, benchmark
+from .benchmarks import ICL_TRUTH, KINECT_READOUT_S, Benchmark, benchmark
 from .files import FileSequence
 from .meshes import first_existing
 from .reading import INTRINSICS_FILE, find_intrinsics, read_numbers, read_text, same_size
@@ -23,7 +24,7 @@ DEPTH_SCALE = 5000.0
 MOST_MISSING = 0.05  # of the listed images; each of Bonn's recordings lacks some
 ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "associate.txt")
 CALIBRATION = "calibration.txt"
-UNKNOWN_CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
+UNKNOWN_CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, readout_s=KINECT_READOUT_S)
 
 Times = NDArray[np.float64]
 
@@ -233,7 +234,9 @@ def _camera(path: Path, known: Benchmark | None, size: tuple[int, int]) -> tuple
         fx, fy, cx, cy = values.tolist()
         return Intrinsics(fx, fy, cx, cy, *size), ()
     camera, notes = find_intrinsics([path], known.camera if known else UNKNOWN_CAMERA, size)
-    if known is None and not by_hand:
+    if known is not None:
+        camera = replace(camera, readout_s=known.camera.readout_s)
+    elif not by_hand:
         notes = (
             *notes,
             f"a standard Kinect is assumed: no {INTRINSICS_FILE} or {CALIBRATION}, and no recording that is known by "

@@ -13,11 +13,12 @@ from ._gpu_blocks import BITS, CELLS, EDGE, HALF, MASK, SCALE, block_key, enter
 from ._gpu_points import camera_row, moved
 
 MAX_WEIGHT, WEIGHT_STEPS = tl.constexpr(fusion.MAX_WEIGHT), tl.constexpr(fusion.WEIGHT_STEPS)
+NEAREST_M = tl.constexpr(fusion.NEAREST_M)
 BASELINE_M, STRIDE = tl.constexpr(fusion.NORMAL_BASELINE_M), tl.constexpr(fusion.NORMAL_STRIDE)
 RED, GREEN, BLUE = tl.constexpr(9798), tl.constexpr(19235), tl.constexpr(3735)  # as OpenCV has them, over 2^15
 ROUNDING = tl.constexpr(1.5 * 2**23)  # a float32 added to it and taken away again is rounded, ties to even
 FX, FY, CX, CY = tl.constexpr(12), tl.constexpr(13), tl.constexpr(14), tl.constexpr(15)
-NEAR, FAR, NOW = tl.constexpr(16), tl.constexpr(17), tl.constexpr(18)
+NEAR, FAR, NOW, SWEEP = tl.constexpr(16), tl.constexpr(17), tl.constexpr(18), tl.constexpr(19)
 
 
 class Listed(NamedTuple):
@@ -31,7 +32,8 @@ class Listed(NamedTuple):
 
 class View(NamedTuple):
     """One frame. depth: float32 [H, W] metres, 0 = none. light: float32 [H, W] in 0..1. normal: float32 [H / 2, W / 2,
-    3] in the camera. numbers: float64 [19]: c2w [3, 4], fx, fy, cx, cy, near and far in metres, number of the frame."""
+    3] in the camera. numbers: float64 [25]: c2w [3, 4], fx, fy, cx, cy, near and far in metres, number of the frame,
+    sweep [6] (see ``fusion.View``)."""
 
     depth: Tensor
     light: Tensor
@@ -99,6 +101,19 @@ def normals_kernel(view, block: tl.constexpr):
 
 
 @triton.jit
+def load_sweep(view):
+    """The six numbers of a sweep, float64."""
+    at = view.numbers + SWEEP
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)
+
+
+@triton.jit
+def drift(s, x, y, z):
+    """See ``fusion.drift``."""
+    return s[0] + s[4] * z - s[5] * y, s[1] + s[5] * x - s[3] * z, s[2] + s[3] * y - s[4] * x
+
+
+@triton.jit
 def touch_kernel(blocks, listed, view, stride, steps, block: tl.constexpr):
     """Make and list the blocks within the truncation of the measured surface along every ``stride``-th pixel, a lane
     for each of ``steps`` points of such a ray. A block without a place is left to a later frame."""
@@ -110,8 +125,11 @@ def touch_kernel(blocks, listed, view, stride, steps, block: tl.constexpr):
     live = d > 0
     edge, reach = tl.load(blocks.lengths) * EDGE, tl.load(blocks.lengths + 1)
     z = d - reach + 2 * reach * step / (steps - 1)
-    x = (u - tl.load(view.numbers + CX)) / tl.load(view.numbers + FX) * z
-    y = (v - tl.load(view.numbers + CY)) / tl.load(view.numbers + FY) * z
+    x = (u - tl.load(view.numbers + CX)) / tl.load(view.numbers + FX)
+    y = (v - tl.load(view.numbers + CY)) / tl.load(view.numbers + FY)
+    dx, dy, dz = drift(load_sweep(view), x * d, y * d, d)
+    share = (v + 0.5).to(tl.float64) / view.height - 0.5
+    x, y, z = x * z + share * dx, y * z + share * dy, z + share * dz
     bx = tl.floor(moved(view.numbers, (x, y, z), 0) / edge).to(tl.int64)
     by = tl.floor(moved(view.numbers, (x, y, z), 1) / edge).to(tl.int64)
     bz = tl.floor(moved(view.numbers, (x, y, z), 2) / edge).to(tl.int64)
@@ -134,6 +152,16 @@ def into_camera(rows, world, axis: tl.constexpr):
 def single(row):
     """Four numbers as float32."""
     return row[0].to(tl.float32), row[1].to(tl.float32), row[2].to(tl.float32), row[3].to(tl.float32)
+
+
+@triton.jit
+def single_sweep(view):
+    """The six numbers of a sweep as float32."""
+    s = load_sweep(view)
+    return (
+        s[0].to(tl.float32), s[1].to(tl.float32), s[2].to(tl.float32),
+        s[3].to(tl.float32), s[4].to(tl.float32), s[5].to(tl.float32),
+    )  # fmt: skip
 
 
 @triton.jit
@@ -167,7 +195,11 @@ def add_view(blocks, view, slot):
             tl.load(view.numbers + CY),
         )
     )
-    there = z > 0.05
+    share = (fy * y / tl.maximum(z, NEAREST_M) + cy + 0.5) / view.height - 0.5
+    share = tl.minimum(tl.maximum(share, -0.5), 0.5)
+    dx, dy, dz = drift(single_sweep(view), x, y, z)
+    x, y, z = x - share * dx, y - share * dy, z - share * dz
+    there = z > NEAREST_M
     ahead = tl.where(there, z, 1.0)
     right, low = tl.floor(fx * x / ahead + cx + 0.5), tl.floor(fy * y / ahead + cy + 0.5)
     there = there & (right >= 0) & (low >= 0) & (right < view.width) & (low < view.height)

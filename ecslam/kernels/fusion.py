@@ -41,13 +41,22 @@ class Blocks(NamedTuple):
 
 class View(NamedTuple):
     """One depth image. depth: float32 [H, W] metres, 0 = none. light: float32 [H, W] in 0..1. normal: float32
-    [H / 2, W / 2, 3] in the camera. camera: fx, fy, cx, cy. c2w: float64 [4, 4]."""
+    [H / 2, W / 2, 3] in the camera. camera: fx, fy, cx, cy. c2w: float64 [4, 4]. sweep: the camera's motion from
+    the first row to the last, translation and rotation vector in its own coordinates; c2w is the pose halfway."""
 
     depth: NDArray[np.float32]
     light: NDArray[np.float32]
     normal: NDArray[np.float32]
     camera: tuple[float, float, float, float]
     c2w: NDArray[np.float64]
+    sweep: tuple[float, float, float, float, float, float]
+
+
+@njit(**INLINE)
+def drift(sweep, x, y, z):
+    """How a point in the camera's coordinates moves during a sweep, as a camera that turns and goes on sees it."""
+    t0, t1, t2, w0, w1, w2 = sweep
+    return t0 + w1 * z - w2 * y, t1 + w2 * x - w0 * z, t2 + w0 * y - w1 * x
 
 
 @njit(**INLINE)
@@ -96,9 +105,11 @@ def touch(blocks, used, view, stride, reach, voxel, stamp, now, out):
             if d <= 0:
                 continue
             x, y = (u - cx) / fx, (v - cy) / fy
+            share = (v + 0.5) / height - 0.5
+            dx, dy, dz = drift(view.sweep, x * d, y * d, d)
             for step in range(steps):
                 z = d - reach + 2 * reach * step / (steps - 1)
-                a, b, c = x * z, y * z, z
+                a, b, c = x * z + share * dx, y * z + share * dy, z + share * dz
                 i = np.floor((m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]) / edge)
                 j = np.floor((m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]) / edge)
                 k = np.floor((m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]) / edge)
@@ -166,11 +177,13 @@ def normals(depth, camera, out, first, last):
 
 @njit(**INLINE)
 def project(key, voxel, view, spot, pixel):
-    """Where a block's voxels lie in the camera: spot float64 [3, 512] metres; pixel int32 [512], row by row, -1 outside
-    the image. Without branches, so that it is done for several at once."""
+    """Where a block's voxels lie in the camera when the row that sees them is read: spot float64 [3, 512] metres; pixel
+    int32 [512], row by row, -1 outside the image. Without branches, so that it is done for several at once."""
     fx, fy, cx, cy = view.camera
     m = view.c2w
     height, width = view.depth.shape
+    t0, t1, t2, w0, w1, w2 = view.sweep
+    moving = (abs(t0) + abs(t1) + abs(t2) + abs(w0) + abs(w1) + abs(w2)) > 0
     bx = ((key >> (2 * BITS)) - HALF) * EDGE
     by = (((key >> BITS) & MASK) - HALF) * EDGE
     bz = ((key & MASK) - HALF) * EDGE
@@ -181,6 +194,10 @@ def project(key, voxel, view, spot, pixel):
             x = m[0, 0] * wx + m[1, 0] * wy + m[2, 0] * wz
             y = m[0, 1] * wx + m[1, 1] * wy + m[2, 1] * wz
             z = m[0, 2] * wx + m[1, 2] * wy + m[2, 2] * wz
+            if moving:
+                share = min(max((fy * y / max(z, NEAREST_M) + cy + 0.5) / height - 0.5, -0.5), 0.5)
+                dx, dy, dz = drift(view.sweep, x, y, z)
+                x, y, z = x - share * dx, y - share * dy, z - share * dz
             cell = EDGE * line + k
             spot[0, cell], spot[1, cell], spot[2, cell] = x, y, z
             ahead = max(z, NEAREST_M)

@@ -11,11 +11,13 @@ from ...types import InputError
 ROOMS = ("studio", "apartment", "corridor")
 PREFIX = "synthetic/"
 MAX_SIDE, MAX_FRAMES = 4096, 100_000
+MOST_READOUT_S = 1 / 30
 
 
 @dataclass(frozen=True)
 class Address:
-    """Which room to render and how. frames: None for one round of the room's path. width, height: pixels."""
+    """Which room to render and how. frames: None for one round of the room's path. width, height: pixels. readout:
+    seconds from an image's first row to its last (a rolling shutter)."""
 
     room: str
     width: int = 640
@@ -23,13 +25,14 @@ class Address:
     frames: int | None = None
     noise: bool = False
     seed: int = 0
+    readout: float = 0.0
 
 
 def parse_address(address: str, defaults: Address | None = None) -> Address:
     """Read a room's name, with or without ``synthetic/`` and with options after ``?`` that override ``defaults``.
 
-    Options: noise=0|1, frames=N, size=WxH, seed=N. Raises InputError for an unknown room, an unknown option or a value
-    out of range.
+    Options: noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS. Raises InputError for an unknown room, an unknown
+    option or a value out of range.
     """
     name, _, query = address.removeprefix(PREFIX).partition("?")
     if name not in ROOMS:
@@ -53,6 +56,8 @@ def check(address: Address) -> Address:
         raise InputError(f"{where}: frames={address.frames} is out of range; use 1 to {MAX_FRAMES}")
     if address.seed < 0:
         raise InputError(f"{where}: seed={address.seed} is negative; use 0 or more")
+    if not 0 <= address.readout <= MOST_READOUT_S:
+        raise InputError(f"{where}: readout={address.readout:g} is out of range; use 0 to {MOST_READOUT_S:g} seconds")
     return address
 
 
@@ -64,9 +69,13 @@ def _apply(address: Address, key: str, value: str, source: str) -> Address:
             return replace(address, frames=int(value))
         if key == "seed":
             return replace(address, seed=int(value))
+        if key == "readout":
+            return replace(address, readout=float(value))
         if key == "size":
             width, height = value.split("x")
             return replace(address, width=int(width), height=int(height))
     except (ValueError, KeyError):
-        raise InputError(f"{source}: cannot read {key}={value}; write noise=0|1, frames=N, size=WxH, seed=N") from None
-    raise InputError(f"{source}: unknown option {key!r}; the options are noise, frames, size and seed")
+        raise InputError(
+            f"{source}: cannot read {key}={value}; write noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS"
+        ) from None
+    raise InputError(f"{source}: unknown option {key!r}; the options are noise, frames, size, seed and readout")

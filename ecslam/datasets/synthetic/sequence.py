@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,7 @@ from .store import kept
 RATE_HZ = 30.0
 FOCAL = 0.8
 MARGIN_M = 0.05
+STRIPS = 24
 PATH_SEED = 1
 
 _baking = threading.Lock()
@@ -50,14 +53,21 @@ def lit_scene(name: str) -> Scene:
 
 
 def open_synthetic(
-    name: str, width: int = 640, height: int = 480, frames: int | None = None, noise: bool = False, seed: int = 0
+    name: str,
+    width: int = 640,
+    height: int = 480,
+    frames: int | None = None,
+    noise: bool = False,
+    seed: int = 0,
+    readout: float = 0.0,
 ) -> SyntheticSequence:
     """Open a built-in room: ``studio``, ``apartment`` or ``corridor``, also as an address with options (see address).
 
     The camera's path is closed: ``frames`` beyond one round (the default) go round again. ``noise`` imitates a Kinect;
-    ``seed`` changes that noise and nothing else. Raises InputError for an unknown room or values out of range.
+    ``seed`` changes that noise and nothing else; ``readout``: see ``Address``. Raises InputError for an
+    unknown room or values out of range.
     """
-    defaults = check(Address("studio", width, height, frames, noise, seed))
+    defaults = check(Address("studio", width, height, frames, noise, seed, readout))
     return SyntheticSequence(parse_address(name, defaults))
 
 
@@ -72,8 +82,8 @@ class SyntheticSequence:
         self.name: str = PREFIX + a.room
         self.layout: str = "synthetic"
         self.preset: str = "lite"
-        focal = FOCAL * a.width
-        self.intrinsics: Intrinsics = Intrinsics(focal, focal, (a.width - 1) / 2, (a.height - 1) / 2, a.width, a.height)
+        focal, centre = FOCAL * a.width, ((a.width - 1) / 2, (a.height - 1) / 2)
+        self.intrinsics: Intrinsics = Intrinsics(focal, focal, *centre, a.width, a.height, readout_s=a.readout)
         self.bounds: NDArray[np.float64] | None = room(a.room).interior + np.array([[-MARGIN_M], [MARGIN_M]])
 
     def __len__(self) -> int:
@@ -87,10 +97,33 @@ class SyntheticSequence:
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         c2w = self._round[index % len(self._round)]
-        color, depth = render(lit_scene(self.address.room), self.intrinsics, c2w)
+        color, depth = self._look(index) if self.address.readout else self._seen(self.intrinsics, c2w)
         if self.address.noise:
             color, depth = kinect(color, depth, self.intrinsics, np.random.default_rng([self.address.seed, index]))
         return Frame(index, index / RATE_HZ, color, depth, c2w.copy())
+
+    def _seen(self, camera: Intrinsics, c2w: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        return render(lit_scene(self.address.room), camera, c2w)
+
+    def _look(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """An image whose strips are seen one after the other from where the camera is by then."""
+        camera, strips = self.intrinsics, []
+        edges = np.linspace(0, camera.height, STRIPS + 1).astype(int)
+        for top, bottom in pairwise(edges):
+            strip = replace(camera, cy=camera.cy - top, height=bottom - top)
+            late = ((top + bottom) / 2 / camera.height - 0.5) * camera.readout_s * RATE_HZ
+            strips.append(self._seen(strip, self._pose_at(index + late)))
+        color, depth = zip(*strips, strict=True)
+        return np.concatenate(color), np.concatenate(depth)
+
+    def _pose_at(self, moment: float) -> NDArray[np.float64]:
+        """[4, 4] between two frames."""
+        first = int(np.floor(moment))
+        before, after = self._round[np.array([first, first + 1]) % len(self._round)]
+        motion, share = np.linalg.inv(before) @ after, moment - first
+        motion[:3, :3] = cv2.Rodrigues(share * cv2.Rodrigues(motion[:3, :3])[0])[0]
+        motion[:3, 3] *= share
+        return before @ motion
 
     def timestamps(self) -> NDArray[np.float64]:
         """[N] seconds, 30 Hz."""
