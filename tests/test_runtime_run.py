@@ -16,6 +16,7 @@ from runtime_watch import running
 from ecslam.commands import progress_line
 from ecslam.config_files import load_config, load_preset
 from ecslam.evaluation.trajectory import absolute_error
+from ecslam.evaluation.trajectory_io import format_tum
 from ecslam.messages import Notice, State, Stop
 from ecslam.runtime import engine as module
 from ecslam.runtime.driven import estimate_mb
@@ -341,6 +342,18 @@ def test_without_a_true_pose_of_the_first_frame_the_surface_is_not_judged(tmp_pa
     told = []
     assert "ate_rmse_cm" in judge_run(tmp_path, tell=told.append)
     assert "the first frame has no true pose" in told[0]
+
+
+def test_a_path_behind_the_truth_is_told(tmp_path):
+    run(tmp_path, FakeSequence(40))
+    times, poses = np.arange(90) / 30, np.tile(np.eye(4), (90, 1, 1))
+    for name, late_s in (("groundtruth", 0.0), ("trajectory", 0.03)):
+        poses[:, :3, 3] = np.stack([np.sin(times - late_s), np.cos(3 * (times - late_s)), times - late_s], 1)
+        (tmp_path / f"{name}.txt").write_text(format_tum(times, poses))
+    told = []
+    figures = judge_run(tmp_path, tell=told.append, surface=False)
+    assert figures["ate_rmse_cm"] > 1
+    assert "the path is 30 ms behind the ground truth, and without that ate_rmse_cm were 0.0" in told[0]
 
 
 @pytest.mark.parametrize("skipped", [(), (0,)])

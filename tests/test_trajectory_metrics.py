@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ecslam.evaluation.trajectory import Similarity, absolute_error, align_umeyama, relative_error
+from ecslam.evaluation.trajectory import Similarity, absolute_error, align_umeyama, find_lag, relative_error
 from ecslam.evaluation.trajectory_io import format_kitti, format_tum, read_tum
 from ecslam.types import InputError
 
@@ -220,3 +220,23 @@ def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "binary").write_bytes(bytes(range(128, 256)))
     with pytest.raises(InputError, match="not a text file"):
         read_tum(tmp_path / "binary")
+
+
+@pytest.mark.parametrize("late_s", [0.03, -0.05, 0.0])
+def test_a_lag_is_found_and_what_the_error_were_without(late_s: float) -> None:
+    times = np.arange(150) / 30
+    truth, estimate = np.tile(np.eye(4), (2, len(times), 1, 1))
+    for poses, moment in ((truth, times), (estimate, times - late_s)):
+        poses[:, :3, 3] = np.stack([np.sin(2 * moment), np.cos(3 * moment), 0.3 * np.sin(5 * moment)], 1)
+    estimate[40], truth[70] = np.nan, np.nan
+    found = find_lag(random_motion(np.random.default_rng(0)).apply_to_poses(estimate), truth, times)
+    assert found is not None
+    assert found.seconds == pytest.approx(late_s, abs=1e-9)
+    assert found.rmse_cm < 0.2
+    assert late_s == 0 or found.share < 0.05
+
+
+def test_a_lag_is_not_looked_for_in_a_moment() -> None:
+    estimate, truth = trajectories(0, 20)
+    assert find_lag(estimate, truth, np.arange(20) / 30) is None
+    assert find_lag(estimate, np.full_like(truth, np.nan), np.arange(20) / 3) is None

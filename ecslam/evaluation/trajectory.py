@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from ..rigid import best_motion, inverse, rotation_angle_deg
 
 Floats = NDArray[np.float64]
+MOST_LAG_S, LAG_STEP_S = 0.1, 0.002
+LEAST_FRAMES = 20
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,33 @@ def relative_error(estimate: Floats, truth: Floats, *, delta: int = 1) -> Relati
     cm = 100 * np.linalg.norm(error[:, :3, 3], axis=1)
     deg = rotation_angle_deg(moved[0], moved[1])
     return RelativeError(Spread.of(cm), Spread.of(deg), len(ok) - delta - len(pairs))
+
+
+@dataclass(frozen=True)
+class Lag:
+    """seconds: by how much an estimate is behind the truth. rmse_cm: its ATE without that, the ``share`` of it with."""
+
+    seconds: float
+    rmse_cm: float
+    share: float
+
+
+def find_lag(estimate: Floats, truth: Floats, times: Floats) -> Lag | None:
+    """The lag of at most ``MOST_LAG_S`` either way without which an estimate [N, 4, 4] fits the truth [N, 4, 4] best;
+    times: [N] of both, ascending seconds. Cameras and whatever measures the truth seldom have one clock, and images are
+    stamped when they have arrived. None where too few frames have both poses."""
+    ok = _finite(estimate) & _finite(truth)
+    known, centres = times[_finite(estimate)], estimate[_finite(estimate), :3, 3]
+    inner = ok & (times >= times[0] + MOST_LAG_S) & (times <= times[-1] - MOST_LAG_S)
+    if inner.sum() < LEAST_FRAMES:
+        return None
+    lags = np.arange(-round(MOST_LAG_S / LAG_STEP_S), round(MOST_LAG_S / LAG_STEP_S) + 1) * LAG_STEP_S
+    goal, rmse = truth[inner, :3, 3], np.empty(len(lags))
+    for i, lag in enumerate(lags):
+        at = np.stack([np.interp(times[inner] + lag, known, axis) for axis in centres.T], 1)
+        rmse[i] = np.sqrt(((align_umeyama(at, goal).apply(at) - goal) ** 2).sum(1).mean())
+    without = max(float(rmse[len(lags) // 2]), 1e-12)
+    return Lag(float(lags[rmse.argmin()]), float(100 * rmse.min()), float(rmse.min()) / without)
 
 
 def _finite(poses: Floats) -> NDArray[np.bool_]:

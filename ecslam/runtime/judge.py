@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from .. import datasets
 from ..atomic import write_atomic
 from ..datasets.meshes import NoSurface, load_mesh
-from ..evaluation.trajectory import absolute_error, relative_error
+from ..evaluation.trajectory import absolute_error, find_lag, relative_error
 from ..evaluation.trajectory_io import read_tum
 from ..types import InputError, Mesh
 
 SAME_S = 1e-6
+WORTH_SAYING = 0.8  # of the error, that a lag leaves
 
 
 def judge_run(
@@ -44,6 +45,12 @@ def judge_run(
     if truth is None:
         raise InputError(f"{folder}: the sequence has no ground truth, so there is nothing to compare with")
     figures = _trajectory_figures(poses, truth)
+    lag = find_lag(poses, truth, times)
+    if lag is not None and lag.share < WORTH_SAYING:
+        tell(
+            f"the path is {1e3 * abs(lag.seconds):.0f} ms {'behind' if lag.seconds > 0 else 'ahead of'} the ground "
+            f"truth, and without that ate_rmse_cm were {lag.rmse_cm:.3f}: do images and ground truth have one clock?"
+        )
     if surface:
         found, note = _surface_figures(folder, about, truth, progress)
         figures |= found
