@@ -353,7 +353,7 @@ def test_a_path_behind_the_truth_is_told(tmp_path):
     told = []
     figures = judge_run(tmp_path, tell=told.append, surface=False)
     assert figures["ate_rmse_cm"] > 1
-    assert "the path is 30 ms behind the ground truth, and without that ate_rmse_cm were 0.0" in told[0]
+    assert "the path is 30 ms behind the ground truth, and without that ate_rmse_cm would be 0.0" in told[0]
 
 
 @pytest.mark.parametrize("skipped", [(), (0,)])
