@@ -45,7 +45,7 @@ $(VENV)/.ready: pyproject.toml | $(BIN)/pip
 		|| (echo "torch could not be installed. If there is none for this Python, name another: make clean, then make PYTHON=python3.13 ..." && exit 1)
 	$(PIP) -e .
 	@echo "Compiling the kernels for this machine ..."
-	@$(BIN)/ecslam run "synthetic/studio?size=80x60&frames=8" --preset live --headless --out $(VENV)/first-run >$(VENV)/first-run.log \
+	@$(BIN)/ecslam run "synthetic/studio?size=80x60&frames=8&noise=1" --preset live --headless --out $(VENV)/first-run >$(VENV)/first-run.log \
 		|| (cat $(VENV)/first-run.log && exit 1)
 	@touch $@
 

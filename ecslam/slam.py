@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from . import kernels as seam
 from .config import Config
+from .denoising import denoised
 from .field import TsdfField, create_field
 from .following import Follower
 from .indices import evenly
@@ -100,6 +101,7 @@ class Slam:
     @flushed()
     def step(self, frame: Frame, interrupt: Interrupt | None = None) -> StepReport:
         """Track the frame; every n-th frame, map. Raises whatever ``interrupt`` raises, called inside long loops."""
+        frame = denoised(frame, self.config)
         if self.mapper is None:
             return self._first_frame(frame, interrupt)
         started = time.perf_counter()

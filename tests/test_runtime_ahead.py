@@ -8,6 +8,7 @@ from ecslam import keyframes, pixels
 from ecslam.config import Config
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import Prefetch, open_sequence
+from ecslam.denoising import denoised
 from ecslam.keyframes import make_keyframe
 from ecslam.pixels import choose_pixels, feature_points, find_corners
 from ecslam.runtime import ahead
@@ -60,7 +61,7 @@ def test_keyframes_are_made_ahead_for_the_frames_whose_turn_it_is(monkeypatch):
     config = load_preset("live")
     frames = [frame for _, frame in Prefetch(ROOM, prepare=preparation(lambda: config, ROOM.intrinsics, "cpu"))]
     assert [frame.index for frame in frames if frame.keyframe is not None] == [0, 5]
-    expected = make_keyframe(ROOM[5], ROOM.intrinsics, config)
+    expected = make_keyframe(denoised(ROOM[5], config), ROOM.intrinsics, config)
     monkeypatch.setattr(keyframes, "choose_pixels", lambda *_, **__: pytest.fail("chosen again"))
     assert np.array_equal(make_keyframe(frames[5], ROOM.intrinsics, config).record, expected.record)
 
@@ -73,8 +74,8 @@ def test_a_keyframe_made_with_other_settings_is_made_again():
 
 def test_images_for_a_gpu_are_put_where_it_can_fetch_them(monkeypatch):
     monkeypatch.setattr(ahead, "pinned", lambda array: array.copy() + 1)
-    frame = ROOM[0]
-    prepared = preparation(lambda: FEW, ROOM.intrinsics, "cuda:0")(frame)
+    frame = denoised(ROOM[0], FEW)
+    prepared = preparation(lambda: FEW, ROOM.intrinsics, "cuda:0")(ROOM[0])
     assert np.array_equal(prepared.color, frame.color + 1)
     assert np.array_equal(prepared.depth, frame.depth + 1)
 
