@@ -47,9 +47,10 @@ def judge_run(
     figures = _trajectory_figures(poses, truth)
     lag = find_lag(poses, truth, times)
     if lag is not None and lag.share < WORTH_SAYING:
+        side = "behind" if lag.seconds > 0 else "ahead of"
         tell(
-            f"the path is {1e3 * abs(lag.seconds):.0f} ms {'behind' if lag.seconds > 0 else 'ahead of'} the ground "
-            f"truth, and without that ate_rmse_cm would be {lag.rmse_cm:.3f}: do images and ground truth have one clock?"
+            f"the path is {1e3 * abs(lag.seconds):.0f} ms {side} the ground truth, and without that ate_rmse_cm would "
+            f"be {lag.rmse_cm:.3f}: do images and ground truth have one clock?"
         )
     if surface:
         found, note = _surface_figures(folder, about, truth, progress)
