@@ -83,7 +83,7 @@ def choose(
 
 def straight(points: Tensor, camera: Intrinsics, sweep: Tensor) -> Tensor:
     """``shutter.straight`` of points [N, 3 or 4], the fourth number left alone; 0 stays 0. sweep: [6]."""
-    at, rest = points[:, :3], points[:, 3:]
+    at, rest, sweep = points[:, :3], points[:, 3:], sweep.to(points.dtype)
     there = at[:, 2:] > 0
     share = (camera.fy * at[:, 1:2] / torch.where(there, at[:, 2:], 1.0) + camera.cy + 0.5) / camera.height - 0.5
     move = sweep[:3] + torch.linalg.cross(sweep[3:].expand_as(at), at)

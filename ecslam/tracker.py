@@ -42,12 +42,7 @@ class Tracker(Protocol):
     """Follows the camera from frame to frame."""
 
     def track(
-        self,
-        frame: Frame,
-        guess: NDArray[np.float64],
-        field: TsdfField,
-        config: Config,
-        sweep: Sweep = STILL,
+        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep = STILL
     ) -> TrackResult:
         """The pose of a frame, sought from ``guess`` [4, 4], that was read during ``sweep`` (see ``shutter``);
         ``guess`` itself with a fit of 0 where hardly anything is measured."""
@@ -69,12 +64,7 @@ class HostTracker:
     recorder: Recorder
 
     def track(
-        self,
-        frame: Frame,
-        guess: NDArray[np.float64],
-        field: TsdfField,
-        config: Config,
-        sweep: Sweep = STILL,
+        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep = STILL
     ) -> TrackResult:
         """See ``Tracker``. Direct alignment of points spread over the image, then the paper's rendered tracking; the
         preset may leave either out. A rendered pose that costs more on the aligned surface is not taken."""

@@ -47,12 +47,7 @@ class GpuTracker:
     recorder: Recorder
 
     def track(
-        self,
-        frame: Frame,
-        guess: NDArray[np.float64],
-        field: TsdfField,
-        config: Config,
-        sweep: Sweep = STILL,
+        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep = STILL
     ) -> TrackResult:
         """See ``Tracker``."""
         device, shown = field.device, self.volume.show(frame)
@@ -60,12 +55,11 @@ class GpuTracker:
         points, rays = grid_cells(shown, a.points, config), t.rays if t.iterations else 0
         numbers = uniform(self.generator, device, 2 * points + rays * (3 + s.uniform + s.near_depth))
         corners = torch.from_numpy(padded_corners(frame, config, rays)).to(device, non_blocking=True)
-        start = torch.from_numpy(guess).to(device, non_blocking=True)
-        swept = torch.from_numpy(sweep.astype(np.float32)).to(device, non_blocking=True)
+        start = torch.from_numpy(np.concatenate([guess.reshape(16), sweep])).to(device, non_blocking=True)
         order = _shuffled(grid_cells(shown, rays, config) if rays else 0, device)
         rates = _rates(t.lr_rotation, t.lr_translation, device)
         over = field, self.volume.blocks, config, shown, order, rates
-        (found,) = self.recorder(partial(self._whole, *over), corners, start, swept, numbers, key=None, over=over)
+        (found,) = self.recorder(partial(self._whole, *over), corners, start, numbers, key=None, over=over)
         pose, (cost, fit, usable), terms = np.split(found.cpu().numpy(), [12, TOLD])
         if usable < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
@@ -82,16 +76,17 @@ class GpuTracker:
         rates: Tensor,
         corners: Tensor,
         start: Tensor,
-        sweep: Tensor,
         numbers: Tensor,
     ) -> tuple[Tensor]:
-        """Everything as a function of tensors: float64 [TOLD, and the loss terms where frames are rendered]."""
+        """Everything as a function of tensors: float64 [TOLD, and the loss terms where frames are rendered]. start:
+        float64 [22], the guess [4, 4] and the sweep [6]."""
         a, settings = config.align, tuple(stages(config))
         cells = grid_cells(frame, a.points, config)
         points = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2))
         rolling = self.camera.readout_s > 0 and config.deskew
+        guess, sweep = start[:16].view(4, 4), start[16:]
         points = straight(points, self.camera, sweep) if rolling else points
-        packed, first = tracking_gpu.packed(blocks, points, start, LEAST_KNOWN)
+        packed, first = tracking_gpu.packed(blocks, points, guess, LEAST_KNOWN)
         row = fusion_gpu.descend(blocks, packed, first, settings, a.iterations, COARSE_STRIDE, RULES)
         pose, terms = row, start.new_empty(0)
         if config.tracking.iterations:

@@ -401,9 +401,8 @@ def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     cells, order = grid_cells(shown, config.align.points, config), grid_cells(shown, config.tracking.rays, config)
     numbers = torch.zeros(2 * cells + 60 * (3 + 7), device=meta)
     corners, order = (torch.zeros(n, dtype=torch.int64, device=meta) for n in (20 if fus else 0, order))
-    start, rates = (torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((4, 4), (1, 6)))
-    sweep = torch.zeros(6, device=meta)
-    given = field, blocks, config, shown, order, rates, corners, start, sweep, numbers
+    start, rates = (torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((22,), (1, 6)))
+    given = field, blocks, config, shown, order, rates, corners, start, numbers
     tracker._whole(*given)  # uploads the layout, once
     with Forbidding():
         (found,) = tracker._whole(*given)
