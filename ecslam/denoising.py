@@ -16,8 +16,8 @@ from .config import Config
 from .kernels import denoise
 from .types import Frame
 
-REACH, STRIDE = 2, 4  # pixels: of the differences that noise is estimated from, and between these
-QUIET = 5e-6  # 1/m: a twentieth of a millimetre at three metres
+REACH, COLUMNS = 2, 159  # of the differences that noise is estimated from: pixels, and about how many in a row
+QUIET = 5e-5  # 1/m: half a millimetre at three metres; Replica and TUM store depth in steps of a third of that
 WITHIN, MOST = 3.5, 0.012  # times the noise, and 1/m: a Kinect's
 
 
@@ -47,9 +47,10 @@ def inverse_noise(depth: NDArray[np.float32]) -> float:
     of those, since depth in steps has many that are 0.
     """
     rows, columns = (max(side - 2 * REACH, 0) for side in depth.shape)
+    stride = max(columns // COLUMNS, 1)
 
     def seen(v: int, u: int) -> NDArray[np.float32]:
-        return np.float32(1) / depth[REACH + v :, REACH + u :][:rows:STRIDE, :columns:STRIDE]
+        return np.float32(1) / depth[REACH + v :, REACH + u :][:rows:stride, :columns:stride]
 
     with np.errstate(divide="ignore", invalid="ignore"):
         twice = 2 * seen(0, 0)

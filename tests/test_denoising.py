@@ -56,6 +56,13 @@ def test_exact_depth_keeps_its_bits(room):
 
 
 @pytest.mark.parametrize("room", ["studio", "apartment", "corridor"])
+def test_exact_depth_as_replica_rounds_it_keeps_its_bits(room):
+    exact = open_sequence(f"synthetic/{room}?frames=300&size=1200x680")[100].depth
+    rounded = np.rint(6553.5 * exact).astype(np.float32) / np.float32(6553.5)
+    assert smoothed(rounded) is rounded
+
+
+@pytest.mark.parametrize("room", ["studio", "apartment", "corridor"])
 def test_depth_in_millimetres_changes_by_about_its_rounding(room):
     exact = open_sequence(f"synthetic/{room}?frames=300")[100].depth
     rounded = np.rint(1000 * exact).astype(np.float32) / np.float32(1000)

@@ -12,8 +12,8 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
-LARGE = 2 << 20
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
+LARGE, HOLES = 16 << 20, 64 << 20
 
 
 def peak_memory_mb() -> float:
@@ -33,13 +33,17 @@ def resident_mb() -> float:
 
 
 def keep_no_holes() -> None:
-    """From now on give every freed block of ``LARGE`` bytes or more back to the system at once, and let threads that
-    start later share one heap, where each reuses what another has freed.
+    """From now on give every freed block of ``LARGE`` bytes or more back to the system at once, keep smaller ones for
+    whatever comes next until ``return_holes``, and let threads that start later share one heap, where each reuses what
+    another has freed.
 
-    glibc raises this limit to 32 MB by itself, and then keeps the holes that meshes and checkpoints leave: 100 MB of
-    them in a run of the studio. Concerns the whole process; does nothing on other systems.
+    Left alone, glibc raises the first limit to 32 MB, and meshes and checkpoints leave 100 MB of holes in a run of the
+    studio; but it gives back whatever comes free at the end of its heap. Images, which come and go there, are below
+    the limit: to have memory cleared anew for each took a third of the time that reading large ones takes. Concerns the
+    whole process; does nothing on other systems.
     """
     _glibc("mallopt", M_MMAP_THRESHOLD, LARGE)
+    _glibc("mallopt", M_TRIM_THRESHOLD, HOLES)
     _glibc("mallopt", M_ARENA_MAX, 1)
 
 

@@ -33,7 +33,7 @@ from .tally import Stopwatch, Tally
 
 ATE_EVERY = 10
 TRAJECTORY_EVERY = 100
-TRIM_EVERY = 5
+HOLES_EVERY_S = 0.4
 THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
@@ -86,6 +86,7 @@ class Run:
             frame=self.tally.position,
         )
         self._color: NDArray[np.uint8] | None = None
+        self._holes_s = 0.0
         self.lost_for = 0
         self._settled = False
         if resumed:
@@ -250,8 +251,9 @@ class Run:
             self.checkpoint()
         if len(self.tally.rows) % TRAJECTORY_EVERY == 0:
             self.write_trajectory()
-        if len(self.tally.rows) % TRIM_EVERY == 0:
+        if monotonic() >= self._holes_s + HOLES_EVERY_S:
             return_holes()
+            self._holes_s = monotonic()
 
     def configure(self, config: Config) -> None:
         """Other tracking and mapping settings from the next frame on; ``config.yaml`` holds the newest ones."""
