@@ -358,7 +358,9 @@ def write_synthetic(name: str, folder: Path, frames: str) -> None:
     with _progress() as bar:
         task = bar.add_task(f"writing {name}", total=len(sequence))
         write_replica(sequence, folder, lambda done, total: bar.update(task, completed=done, total=total))
-    console.print(f"{folder}: {len(sequence)} frames in the Replica layout", soft_wrap=True)
+    readout_s = sequence.intrinsics.readout_s
+    told = f"; the layout cannot tell its shutter, so open it as {folder}?readout={readout_s:g}" if readout_s else ""
+    console.print(f"{folder}: {len(sequence)} frames in the Replica layout{told}", soft_wrap=True)
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:

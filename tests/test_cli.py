@@ -104,6 +104,11 @@ def assert_refused(outcome: Outcome, *parts: str) -> None:
 # ---- a small run ----------------------------------------------------------------------------------------------------
 
 
+def test_synth_says_how_to_open_a_room_with_a_rolling_shutter(tmp_path):
+    done = ecslam("synth", f"{ROOM}&readout=0.03", tmp_path / "rolling", "--frames", "0:2")
+    assert f"open it as {tmp_path / 'rolling'}?readout=0.03" in done.out
+
+
 def test_synth_writes_what_check_accepts(sequence):
     assert {p.name for p in sequence.iterdir()} == {"results", "traj.txt", "cam_params.json", "mesh.ply"}
     report = ecslam("check", sequence)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 import shutil
@@ -20,6 +21,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ecslam.datasets import open_sequence, problems, registry, select_frames
+from ecslam.datasets.check import check_sequence, format_report
 from ecslam.datasets.reading import rigid
 from ecslam.datasets.tum import associate, interpolate_poses
 from ecslam.types import FrameError, InputError, Sequence
@@ -305,6 +307,28 @@ def test_a_selection_keeps_times_poses_and_images_together(folder: Path) -> None
     for i, frame in enumerate(part):
         np.testing.assert_array_equal(frame.c2w_gt, poses[i])
         np.testing.assert_array_equal(frame.color, whole[1 + 2 * i].color)
+
+
+def test_a_rolling_shutter_can_be_told_of_any_camera(layout: str, folder: Path) -> None:
+    as_it_is, told = open_sequence(folder), open_sequence(f"{folder}?readout=0.025")
+    assert told.intrinsics == dataclasses.replace(as_it_is.intrinsics, readout_s=0.025)
+    assert (told.name, told.layout, len(told)) == (as_it_is.name, layout, N)
+    np.testing.assert_array_equal(told[N - 1].depth, as_it_is[N - 1].depth)
+    assert told[N - 1].index == N - 1
+    assert "read row by row in 25 ms" in format_report(check_sequence(told))
+    assert "row by row" not in format_report(check_sequence(f"{folder}?readout=0"))
+
+
+@pytest.mark.parametrize("given", ["", "fast", "-0.01", "0.2", "nan", "30"])
+def test_a_readout_that_no_camera_has_is_refused(folder: Path, given: str) -> None:
+    with pytest.raises(InputError, match=r"readout=.*seconds"):
+        open_sequence(f"{folder}?readout={given}")
+
+
+def test_another_option_is_refused_by_its_name(layout: str, folder: Path) -> None:
+    taken = "readout, color, depth" if layout == "rosbag" else "readout"
+    with pytest.raises(InputError, match=f"no option 'read'; {taken} can follow"):
+        open_sequence(f"{folder}?read=0.03")
 
 
 def test_colour_and_depth_that_cannot_match_are_refused(folder: Path) -> None:

@@ -125,6 +125,7 @@ def format_report(report: CheckReport) -> str:
     """The report as text for a terminal, one fact a line, oddities last."""
     k, d, t, p = report.intrinsics, report.depth, report.time, report.poses
     lens = ", distortion removed on reading" if k.distortion else ""
+    rolling = f", depth read row by row in {1e3 * k.readout_s:.0f} ms" if k.readout_s else ""
     rows = [
         ("sequence", f"{report.name} ({report.layout} layout, preset {report.preset})"),
         (
@@ -134,7 +135,7 @@ def format_report(report: CheckReport) -> str:
         ("images", f"{k.width}x{k.height}, fx {k.fx:.1f} fy {k.fy:.1f} cx {k.cx:.1f} cy {k.cy:.1f}{lens}"),
         ("depth", f"{d.low_m:.2f} .. {d.high_m:.2f} m, median {d.median_m:.2f} m, {d.missing:.0%} of pixels without"),
         ("used", f"{report.used_m[0]:.2f} .. {report.used_m[1]:.2f} m, {1 - d.too_near - d.too_far:.0%} of the depth"),
-        ("time", f"{t.duration_s:.1f} s at {t.fps:.1f} frames/s"),
+        ("time", f"{t.duration_s:.1f} s at {t.fps:.1f} frames/s{rolling}"),
         ("poses", "no ground truth" if p is None else _pose_line(p)),
         *(("unreadable", message) for message in report.unreadable),
         *(("odd", message) for message in report.odd or ("nothing",)),

@@ -15,13 +15,15 @@ from typing import Any, Protocol, cast
 from urllib.parse import parse_qsl
 
 from ..types import InputError, Sequence
+from .views import with_readout
 
 SYNTHETIC = "synthetic/"
+READOUT, MOST_READOUT_S = "readout", 0.1
 
 
 class Layout(Protocol):
     """A module of this folder that knows one way of laying a sequence out on disk. ``OPTIONS``, if it has any: what may
-    follow a ``?`` after the path, which ``open`` takes by these names."""
+    follow a ``?`` after the path beside ``READOUT``, which ``open`` takes by these names."""
 
     __name__: str
     __doc__: str | None
@@ -50,6 +52,7 @@ def summary(layout: Layout) -> str:
 def open_sequence(path_or_address: str | Path, **synthetic_options: Any) -> Sequence:
     """Open a folder or file of any known layout, or a built-in room such as ``synthetic/studio``.
 
+    ``?readout=SECONDS`` after a path says how long its camera takes from the first row of depth to the last.
     ``synthetic_options`` go to the built-in rooms (image size, number of frames ...). Raises InputError, in one line,
     when there is no such folder, it is laid out in no known way, or its parts do not belong together.
     """
@@ -95,10 +98,28 @@ def _open_path(path: Path, options: dict[str, str]) -> Sequence:
     if layout is None:
         raise InputError(_why_unknown(path))
     taken = getattr(layout, "OPTIONS", ())
-    wrong = next((name for name in options if name not in taken), None)
+    wrong = next((name for name in options if name not in (READOUT, *taken)), None)
     if wrong is not None:
-        raise InputError(f"{path}: takes no option {wrong!r}; {', '.join(taken) or 'none'} can follow the path")
-    return layout.open(path, **options)
+        raise InputError(f"{path}: takes no option {wrong!r}; {', '.join((READOUT, *taken))} can follow the path")
+    readout = _read_readout(path, options.pop(READOUT, None))
+    sequence = layout.open(path, **options)
+    return sequence if readout is None else with_readout(sequence, readout)
+
+
+def _read_readout(path: Path, given: str | None) -> float | None:
+    """Seconds from the first row of a depth image to its last. Raises InputError."""
+    if given is None:
+        return None
+    try:
+        seconds = float(given)
+    except ValueError:
+        seconds = -1.0
+    if not 0 <= seconds <= MOST_READOUT_S:
+        raise InputError(
+            f"{path}: {READOUT}={given}: write the seconds from a depth image's first row to its last, 0 to "
+            f"{MOST_READOUT_S:g}; 0 where the camera sees all of it at once"
+        )
+    return seconds
 
 
 def _why_unknown(path: Path) -> str:

@@ -57,6 +57,13 @@ class SequenceView:
         return self.base.reference_mesh()
 
 
+def with_readout(sequence: Sequence, readout_s: float) -> Sequence:
+    """The same sequence, whose camera takes ``readout_s`` seconds from the first row of depth to the last."""
+    view = SequenceView(sequence, np.arange(len(sequence)))
+    view.intrinsics = dataclasses.replace(sequence.intrinsics, readout_s=readout_s)
+    return view
+
+
 def select_frames(sequence: Sequence, spec: str) -> Sequence:
     """The frames ``A:B:STEP`` with the meaning of a Python slice, as a view; an empty ``spec`` is the whole sequence.
 
