@@ -54,19 +54,31 @@ def beside(folder: Path) -> Path:
 
 def to_json(value: Any) -> str:
     """One line of JSON; numpy numbers and arrays become plain ones, NaN becomes null (JSON has no NaN)."""
-    return json.dumps(_plain(value), separators=(",", ":"), allow_nan=False)
+    try:
+        return _dumps(value)
+    except ValueError:
+        return _dumps(_without_nan(value))
 
 
-def _plain(value: Any) -> Any:
+def _dumps(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False, default=_listed)
+
+
+def _listed(value: Any) -> Any:
+    """A numpy number or array as a plain one. Raises TypeError for anything else."""
+    if not hasattr(value, "tolist"):
+        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+    return value.tolist()
+
+
+def _without_nan(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {k: _without_nan(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [_without_nan(v) for v in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float) and value - value != 0:
-        return None
-    return value
+        return _without_nan(value.tolist())
+    return None if isinstance(value, float) and value - value != 0 else value
 
 
 class LineLog:

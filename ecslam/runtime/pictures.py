@@ -13,13 +13,12 @@ SCALE_TOP, SCALE_BOTTOM, SCALE_LEFT, SCALE_RIGHT = 4, 12, 12, 38  # pixels from 
 
 
 def shrink(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    """A colour image at most ``width`` pixels wide: means of squares of pixels, three times as fast as of parts."""
-    edge = -(-image.shape[1] // width)
-    if edge == 1:
-        return image
-    rows, columns = max(1, image.shape[0] // edge), image.shape[1] // edge
-    whole = image[: rows * edge, : columns * edge]
-    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
+    """A colour image at most ``width`` pixels wide, halved until it is: three times as quick as in one step."""
+    while image.shape[1] > width:
+        rows, columns = max(1, image.shape[0] // 2), image.shape[1] // 2
+        whole = image[: 2 * rows, : 2 * columns]
+        image = np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
+    return image
 
 
 def jpeg(image: NDArray[np.uint8]) -> bytes:

@@ -29,11 +29,10 @@ from .meshjobs import MESH_POINTS, FrozenMap
 from .pictures import jpeg, shrink
 from .runfolder import CAMERA, RunFolder, read_about
 from .summary import summarise
-from .tally import Stopwatch, Tally
+from .tally import Every, Stopwatch, Tally
 
 ATE_EVERY = 10
-TRAJECTORY_EVERY = 100
-HOLES_EVERY_S = 0.4
+TRAJECTORY_EVERY_S, HOLES_EVERY_S = 5.0, 0.4
 THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
@@ -86,7 +85,7 @@ class Run:
             frame=self.tally.position,
         )
         self._color: NDArray[np.uint8] | None = None
-        self._holes_s = 0.0
+        self._writing, self._tidying = Every(TRAJECTORY_EVERY_S), Every(HOLES_EVERY_S)
         self.lost_for = 0
         self._settled = False
         if resumed:
@@ -249,11 +248,10 @@ class Run:
             self.warn(report.note, report.frame)
         if self._checkpoints.due(self.tally.position):
             self.checkpoint()
-        if len(self.tally.rows) % TRAJECTORY_EVERY == 0:
+        if self._writing.due():
             self.write_trajectory()
-        if monotonic() >= self._holes_s + HOLES_EVERY_S:
+        if self._tidying.due():
             return_holes()
-            self._holes_s = monotonic()
 
     def configure(self, config: Config) -> None:
         """Other tracking and mapping settings from the next frame on; ``config.yaml`` holds the newest ones."""

@@ -98,3 +98,18 @@ class Stopwatch:
     def resume(self) -> None:
         """Count again."""
         self._total_s, self._since = self.seconds, monotonic()
+
+
+class Every:
+    """When it is time for what is worth doing only every so many seconds, however fast frames come."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds, self._next = seconds, 0.0
+
+    def due(self) -> bool:
+        """Whether it is time, at first and ``seconds`` after it last was."""
+        now = monotonic()
+        due = now >= self._next
+        if due:
+            self._next = now + self._seconds
+        return due
