@@ -14,8 +14,8 @@ keep_no_holes()
 np.ones(30 << 20, np.uint8)
 before = resident_mb()
 blocks, small = [], []
-for _ in range(8):
-    blocks.append(np.ones(17 << 20, np.uint8))
+for _ in range(24):
+    blocks.append(np.ones(6 << 20, np.uint8))
     small.append(np.ones(100 << 10, np.uint8))
 held = resident_mb() - before
 del blocks

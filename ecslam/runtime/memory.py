@@ -13,7 +13,7 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
-LARGE, HOLES = 16 << 20, 64 << 20
+LARGE, HOLES = 4 << 20, 64 << 20
 
 
 def peak_memory_mb() -> float:
@@ -38,9 +38,9 @@ def keep_no_holes() -> None:
     another has freed.
 
     Left alone, glibc raises the first limit to 32 MB, and meshes and checkpoints leave 100 MB of holes in a run of the
-    studio; but it gives back whatever comes free at the end of its heap. Images, which come and go there, are below
-    the limit: to have memory cleared anew for each took a third of the time that reading large ones takes. Concerns the
-    whole process; does nothing on other systems.
+    studio; but it gives back whatever comes free at the end of its heap. Images of up to a million pixels, which come
+    and go there, are below the limit: to have memory cleared anew for each took a third of the time that reading large
+    ones takes. Concerns the whole process; does nothing on other systems.
     """
     _glibc("mallopt", M_MMAP_THRESHOLD, LARGE)
     _glibc("mallopt", M_TRIM_THRESHOLD, HOLES)
