@@ -101,15 +101,13 @@ def _open_path(path: Path, options: dict[str, str]) -> Sequence:
     wrong = next((name for name in options if name not in (READOUT, *taken)), None)
     if wrong is not None:
         raise InputError(f"{path}: takes no option {wrong!r}; {', '.join((READOUT, *taken))} can follow the path")
-    readout = _read_readout(path, options.pop(READOUT, None))
+    given = options.pop(READOUT, None)
     sequence = layout.open(path, **options)
-    return sequence if readout is None else with_readout(sequence, readout)
+    return sequence if given is None else with_readout(sequence, _read_readout(path, given))
 
 
-def _read_readout(path: Path, given: str | None) -> float | None:
+def _read_readout(path: Path, given: str) -> float:
     """Seconds from the first row of a depth image to its last. Raises InputError."""
-    if given is None:
-        return None
     try:
         seconds = float(given)
     except ValueError:
