@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from .descent import COARSE_STRIDE, RULES, Alignment
-from .kernels import AlignSettings, NormalEquations, fusion, fusion_descent
+from .kernels import AlignSettings, NormalEquations, fusion, fusion_descent, fusion_views
 from .kernels.graphs import Recorder
 from .pixels import Points
 from .shutter import STILL, Sweep
@@ -53,23 +53,24 @@ class FusedVolume:
         depth = np.where((frame.depth >= near_m) & (frame.depth <= far_m), frame.depth, np.float32(0))
         light = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1 / 255)
         numbers = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        step, threads = fusion.NORMAL_STRIDE, torch.get_num_threads()
+        step, threads = fusion_views.NORMAL_STRIDE, torch.get_num_threads()
         normal = np.empty((-(-depth.shape[0] // step), -(-depth.shape[1] // step), 3), np.float32)
         edges = np.linspace(0, len(normal), threads + 1).astype(int)
-        parts = [_pool().submit(fusion.normals, depth, numbers, normal, *rows) for rows in pairwise(edges)]
-        view = fusion.View(depth, light, normal, numbers, np.ascontiguousarray(c2w), tuple(sweep.tolist()))
+        parts = [_pool().submit(fusion_views.normals, depth, numbers, normal, *rows) for rows in pairwise(edges)]
+        view = fusion_views.View(depth, light, normal, numbers, np.ascontiguousarray(c2w), tuple(sweep.tolist()))
         listed = self._touch(view)
         _wait(parts)
         halves = np.array_split(listed, threads)
-        parts = [_pool().submit(fusion.integrate, self._blocks, rows, view, *self._lengths) for rows in halves[1:]]
-        fusion.integrate(self._blocks, halves[0], view, *self._lengths)
+        blocks, add = self._blocks, fusion_views.integrate
+        parts = [_pool().submit(add, blocks, rows, view, *self._lengths) for rows in halves[1:]]
+        add(blocks, halves[0], view, *self._lengths)
         _wait(parts)
 
-    def _touch(self, view: fusion.View) -> NDArray[np.int64]:
+    def _touch(self, view: fusion_views.View) -> NDArray[np.int64]:
         """The rows of the blocks near what a view measured, made where there were none."""
         while True:
             self._now += 1
-            self.used, listed = fusion.touch(
+            self.used, listed = fusion_views.touch(
                 *(self._blocks, self.used, view, STRIDE, self.truncation_m, self.voxel_m),
                 *(self._stamp, self._now, self._listed),
             )

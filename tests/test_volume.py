@@ -122,7 +122,7 @@ def test_sums_are_the_derivative_of_the_cost(colour):
 
 
 def test_alignment_finds_the_pose_in_a_corner():
-    found = fused(corner(), [np.eye(4), pose((0, 6, 2)), pose((4, -5, 0))])
+    found = fused(corner(), [pose(centre=(1e-3, 2e-3, -1e-3)), pose((0, 6, 2)), pose((4, -5, 0))])
     true = pose((2, 3, -1), (0.02, 0.01, -0.02))
     guess = pose((3, 2, 0), (0.05, -0.01, 0.01))
     points = known_points(found, measured(corner(), true), guess)

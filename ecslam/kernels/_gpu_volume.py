@@ -1,4 +1,4 @@
-"""Triton kernels that average a frame into the fused TSDF volume: see ``fusion`` for what they compute."""
+"""Triton kernels that average a frame into the fused TSDF volume: see ``fusion_views`` for what they compute."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from . import fusion
+from . import fusion_views
 from ._gpu_blocks import BITS, CELLS, EDGE, HALF, MASK, SCALE, block_key, enter
 from ._gpu_points import camera_row, moved
 
-MAX_WEIGHT, WEIGHT_STEPS = tl.constexpr(fusion.MAX_WEIGHT), tl.constexpr(fusion.WEIGHT_STEPS)
-NEAREST_M = tl.constexpr(fusion.NEAREST_M)
-BASELINE_M, STRIDE = tl.constexpr(fusion.NORMAL_BASELINE_M), tl.constexpr(fusion.NORMAL_STRIDE)
+MAX_WEIGHT, WEIGHT_STEPS = tl.constexpr(fusion_views.MAX_WEIGHT), tl.constexpr(fusion_views.WEIGHT_STEPS)
+NEAREST_M = tl.constexpr(fusion_views.NEAREST_M)
+BASELINE_M, STRIDE = tl.constexpr(fusion_views.NORMAL_BASELINE_M), tl.constexpr(fusion_views.NORMAL_STRIDE)
 RED, GREEN, BLUE = tl.constexpr(9798), tl.constexpr(19235), tl.constexpr(3735)  # as OpenCV has them, over 2^15
 ROUNDING = tl.constexpr(1.5 * 2**23)  # a float32 added to it and taken away again is rounded, ties to even
 FX, FY, CX, CY = tl.constexpr(12), tl.constexpr(13), tl.constexpr(14), tl.constexpr(15)
@@ -33,7 +33,7 @@ class Listed(NamedTuple):
 class View(NamedTuple):
     """One frame. depth: float32 [H, W] metres, 0 = none. light: float32 [H, W] in 0..1. normal: float32 [H / 2, W / 2,
     3] in the camera. numbers: float64 [25]: c2w [3, 4], fx, fy, cx, cy, near and far in metres, number of the frame,
-    sweep [6] (see ``fusion.View``)."""
+    sweep [6] (see ``fusion_views.View``)."""
 
     depth: Tensor
     light: Tensor
@@ -68,7 +68,7 @@ def depth_at(view, u, v, there):
 
 @triton.jit
 def normals_kernel(view, block: tl.constexpr):
-    """See ``fusion.normals``."""
+    """See ``fusion_views.normals``."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     columns = (view.width + STRIDE - 1) // STRIDE
     live = i < (view.height + STRIDE - 1) // STRIDE * columns
@@ -109,7 +109,7 @@ def load_sweep(view):
 
 @triton.jit
 def drift(s, x, y, z):
-    """See ``fusion.drift``."""
+    """See ``fusion_views.drift``."""
     return s[0] + s[4] * z - s[5] * y, s[1] + s[5] * x - s[3] * z, s[2] + s[3] * y - s[4] * x
 
 
@@ -172,8 +172,8 @@ def nearest(x):
 
 @triton.jit
 def add_view(blocks, view, slot):
-    """Add a view to the block in ``slot``: see ``fusion.integrate``. Its corner is placed in the camera in float64, the
-    rest is float32."""
+    """Add a view to the block in ``slot``: see ``fusion_views.integrate``. Its corner is placed in the camera in
+    float64, the rest is float32."""
     voxel, truncation = tl.load(blocks.lengths), tl.load(blocks.lengths + 1).to(tl.float32)
     rows = camera_row(view.numbers, 0), camera_row(view.numbers, 1), camera_row(view.numbers, 2)
     key = tl.load(blocks.keys + slot)
