@@ -12,7 +12,8 @@ import torch
 from fake_graphs import FakeGraphs, Forbidding, launch_nothing
 from kernel_cases import relative_rms
 from on_gpu import DEVICE, INTERPRETED, moved
-from planes import corner, look, look_row_by_row, pose
+from planes import POSES, SWEEP, corner, look, look_row_by_row, noisy_corner, pose
+from planes import TINY_CAMERA as CAMERA
 
 from ecslam import volume_gpu
 from ecslam.align import align, known_points, stages
@@ -31,20 +32,12 @@ from ecslam.rays import upload
 from ecslam.shutter import STILL, straight_pixels
 from ecslam.tracker import HostTracker
 from ecslam.tracker_gpu import TOLD, GpuTracker
-from ecslam.types import Intrinsics
 from ecslam.volume import FusedVolume, create_volume
 from ecslam.volume_gpu import GpuVolume
 
 torch.set_num_threads(1)
-CAMERA = Intrinsics(48.0, 48.0, 23.6, 17.3, 48, 36)
-SWEEP = np.array([0.03, -0.02, 0.04, 0.02, -0.03, 0.01])
 LENGTHS = (0.04, 0.11)  # no voxel of the corner lies exactly a truncation away
 CONFIG = Config(border_px=1, truncation_m=0.11, align=AlignConfig(gradient_range=(0.5, 1.5)))
-POSES = (
-    pose((0.3, -0.2, 0.1), (0.013, 0.007, 0.003)),
-    pose((0.4, 6.0, 2.0), (-0.011, 0.002, 0.017)),
-    pose((4.0, -5.0, 0.3), (0.021, 0.012, 0.001)),
-)
 TRUE, GUESS, FAR_GUESS = pose((2, 3, -1), (0.02, 0.01, -0.02)), pose((3, 2, 0), (0.05, -0.01, 0.01)), pose((3, -9, 6))
 
 
@@ -55,15 +48,6 @@ def large_blocks(monkeypatch):
         monkeypatch.setattr(fusion_gpu, "POINTS", 512)
     monkeypatch.setattr(volume_gpu, "SLOTS", 1 << 9)
     monkeypatch.setattr(volume_gpu, "LEAST_POINTS", 64)
-
-
-def frame(c2w, camera=CAMERA):
-    """The corner with noise, holes, an edge in depth and colours."""
-    seen, rng = look(c2w, corner(), camera), np.random.default_rng(0)
-    depth = seen.depth + rng.normal(0, 0.004, seen.depth.shape).astype(np.float32)
-    depth[rng.random(depth.shape) < 0.05] = 0
-    depth[20:, 30:] -= 0.4 * (depth[20:, 30:] > 0)
-    return replace(seen, depth=depth, color=rng.integers(0, 256, seen.color.shape, np.uint8))
 
 
 def both(frames, poses=POSES):
@@ -129,7 +113,7 @@ def test_replays_average_in_what_plain_calls_do(pair):
 
 @pytest.mark.parametrize("width", [48, 47])
 def test_noise_holes_edges_and_colours(width):
-    frames = [frame(c2w, replace(CAMERA, width=width)) for c2w in POSES]
+    frames = [noisy_corner(c2w, replace(CAMERA, width=width)) for c2w in POSES]
     assert_alike(*both(frames))
 
 
@@ -203,7 +187,7 @@ class Counting(FusedVolume):
 
 @pytest.mark.parametrize("iterations", [1, 4, 10, 40])
 def test_a_descent_that_refuses_steps(iterations):
-    frames, theirs = [frame(c2w) for c2w in POSES], Counting(*LENGTHS)
+    frames, theirs = [noisy_corner(c2w, CAMERA) for c2w in POSES], Counting(*LENGTHS)
     theirs.costs = []
     add(theirs, frames)
     mine = GpuVolume(*LENGTHS, DEVICE)

@@ -10,6 +10,7 @@ from ecslam import se3
 from ecslam.types import Frame, Intrinsics
 
 CAMERA = Intrinsics(160.0, 160.0, 79.5, 59.5, 160, 120)
+TINY_CAMERA = Intrinsics(48.0, 48.0, 23.6, 17.3, 48, 36)
 
 
 def look(c2w, planes, camera=CAMERA):
@@ -53,3 +54,20 @@ def pose(rotation_deg=(0, 0, 0), centre=(0, 0, 0)):
     """c2w [4, 4] of a rotation vector and a centre."""
     xi = torch.tensor([*centre, *np.radians(rotation_deg)], dtype=torch.float64)
     return se3.retract(torch.eye(4, dtype=torch.float64), xi).numpy()
+
+
+def noisy_corner(c2w, camera):
+    """The corner with noise, holes, an edge in depth and colours."""
+    seen, rng = look(c2w, corner(), camera), np.random.default_rng(0)
+    depth = seen.depth + rng.normal(0, 0.004, seen.depth.shape).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.05] = 0
+    depth[20:, 30:] -= 0.4 * (depth[20:, 30:] > 0)
+    return replace(seen, depth=depth, color=rng.integers(0, 256, seen.color.shape, np.uint8))
+
+
+POSES = (  # from which no voxel is seen exactly on the border between two pixels
+    pose((0.3, -0.2, 0.1), (0.013, 0.007, 0.003)),
+    pose((0.4, 6.0, 2.0), (-0.011, 0.002, 0.017)),
+    pose((4.0, -5.0, 0.3), (0.021, 0.012, 0.001)),
+)
+SWEEP = np.array([0.03, -0.02, 0.04, 0.02, -0.03, 0.01])
