@@ -78,7 +78,7 @@ class AlignConfig:
     """
 
     to: Literal["fused", "learned", "none"] = "fused"
-    voxel_m: float = _number(0.02, 1e-3, 1.0)
+    voxel_m: float = _number(0.015, 1e-3, 1.0)
     points: int = _number(2000, 64, 200_000)
     iterations: int = _number(10, 1, 100)
     kernels_m: tuple[float, ...] = (0.06, 0.02)
