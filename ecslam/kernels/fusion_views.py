@@ -129,12 +129,12 @@ def normals(depth, camera, out, first, last):
 
 
 class Cells(NamedTuple):
-    """Room for the voxels of one block, each array [512] or [n, 512] of them, x fastest.
+    """Room for what is worked out of the voxels of one block, x fastest.
 
-    spot: float32 [3], where they lie in the camera, ``NOWHERE_M`` deep outside the image. ray: float32 [2], through the
-    pixel that sees them. pixel, slope: uint32, where that is in an image and among the normals. seen: uint32, the
-    voxels that a view changes, packed. depth: float32, there. found: float32 [4], luminance and normal there. held:
-    float32 [3], the voxels themselves.
+    spot: float32 [3, 512], where they lie in the camera; ``NOWHERE_M`` deep outside the image. ray: float32 [2, 512],
+    through the pixel that sees them. pixel, slope: uint32 [512], where that is in an image and among the normals. seen:
+    uint32 [513], those a view may change, from the first place on. depth: float32 [512]; found: float32 [4, 512],
+    luminance and normal in that pixel. held: float32 [3, 512], the voxels themselves.
     """
 
     spot: NDArray[np.float32]
@@ -232,20 +232,18 @@ def average(cells, truncation):
 @njit(**OPTIONS)
 def integrate(blocks, rows, view, voxel, truncation):
     """Add a view to the blocks ``rows``."""
-    flat, whole = np.empty((2, CELLS), np.float32), np.empty((3, CELLS), np.uint32)
-    cells = Cells(
-        np.empty((3, CELLS), np.float32), flat, whole[0], whole[1], np.empty(CELLS + 1, np.uint32),
-        np.empty(CELLS, np.float32), np.zeros((4, CELLS), np.float32), np.zeros((3, CELLS), np.float32),
-    )  # fmt: skip
+    spot, ray, depth = np.empty((3, CELLS), np.float32), np.empty((2, CELLS), np.float32), np.empty(CELLS, np.float32)
+    pixel, slope, seen = np.empty(CELLS, np.uint32), np.empty(CELLS, np.uint32), np.empty(CELLS + 1, np.uint32)
+    found, held = np.zeros((4, CELLS), np.float32), np.zeros((3, CELLS), np.float32)
+    cells = Cells(spot, ray, pixel, slope, seen, depth, found, held)
     for row in rows:
         voxels = blocks.voxels[row]
         project(blocks.place[row], voxel, view, cells)
         count = fetch(voxels, view, np.float32(2 * truncation), cells)
         if count > 0:
             average(cells, truncation)
-        held = cells.held
         for n in range(count):
-            cell = cells.seen[n]
+            cell = seen[n]
             voxels[cell, 0] = np.int16(held[0, cell])
             voxels[cell, 1] = np.int16(held[1, cell])
             voxels[cell, 2] = np.int16(held[2, cell])
