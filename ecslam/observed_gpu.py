@@ -24,7 +24,7 @@ class ObservedTable:
         """Mark the voxels of a view's points [N, 3], given in its camera, c2w [4, 4]."""
         self.views += 1
         points, pose = (torch.from_numpy(a).to(self.marks.device, non_blocking=True) for a in (local, c2w))
-        self.marks[self._slots(points.double() @ pose[:3, :3].mT + pose[:3, 3])] = True
+        self.marks.index_fill_(0, self._slots(points.double() @ pose[:3, :3].mT + pose[:3, 3]), True)
 
     def state(self) -> dict[str, NDArray[np.int64]]:
         """That of ``ObservedVoxels`` before the first view: the views are added again."""

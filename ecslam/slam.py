@@ -207,14 +207,15 @@ class Slam:
                 self._stream.wait_stream(torch.cuda.current_stream(self.device))
             self._pending = self._pool.submit(self._beside, window, iterations)
             return None
-        centres, before = self.trajectory.poses()[:, :3, 3].astype(np.float32), self.trajectory[-1]
+        before = self.trajectory.poses() if len(old) else None
         mapped = self._optimise(window, iterations, interrupt)
         self._apply(mapped)
-        if len(old) == 0:
+        if before is None:
             return None
         met, result = tuple(self.keyframes[i].frame for i in old), mapped.result
         after = sum(result.losses.values())
-        return loop_event(frame, met, before, self.trajectory[-1], result.loss_first, after, centres)
+        centres = before[:, :3, 3].astype(np.float32)
+        return loop_event(frame, met, before[-1], self.trajectory[-1], result.loss_first, after, centres)
 
     def _mapping_is_due(self) -> bool:
         """Counted in keyframes, for those that were missed put nothing off by a whole period."""
@@ -268,6 +269,9 @@ class Slam:
         began = time.perf_counter()
         mapped, self._pending = self._pending.result(), None
         waited_s = time.perf_counter() - began
+        if self._stream is not None:
+            # A mapping that diverged is undone after it last waited.
+            torch.cuda.current_stream(self.device).wait_stream(self._stream)
         self._apply(mapped, mapped.took_s)
         return waited_s
 

@@ -20,7 +20,7 @@ from .shutter import STILL, Sweep
 from .types import Frame, Intrinsics
 from .volume import STRIDE
 
-SLOTS = 1 << 15
+SLOTS = 1 << 16
 MOST_TAKEN = 0.5
 LEAST_POINTS = 2048
 COPIED = 4096  # blocks at a time

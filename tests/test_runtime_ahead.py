@@ -1,5 +1,7 @@
 """What the reading threads do for a frame before its turn."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import torch
@@ -73,18 +75,19 @@ def test_a_keyframe_made_with_other_settings_is_made_again():
 
 
 def test_images_for_a_gpu_are_put_where_it_can_fetch_them(monkeypatch):
-    monkeypatch.setattr(ahead, "pinned", lambda array: array.copy() + 1)
+    monkeypatch.setattr(ahead, "pinned", lambda array, device: array.copy() + int(device[-1]))
     frame = denoised(ROOM[0], FEW)
-    prepared = preparation(lambda: FEW, ROOM.intrinsics, "cuda:0")(ROOM[0])
-    assert np.array_equal(prepared.color, frame.color + 1)
-    assert np.array_equal(prepared.depth, frame.depth + 1)
+    prepared = preparation(lambda: FEW, ROOM.intrinsics, "cuda:3")(ROOM[0])
+    assert np.array_equal(prepared.color, frame.color + 3)
+    assert np.array_equal(prepared.depth, frame.depth + 3)
 
 
 def test_a_copy_for_a_gpu_is_in_one_piece_however_the_image_lies_in_memory(monkeypatch):
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *size, pin_memory, **how: empty(*size, **how))
+    monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
     for image in (ROOM[0].color[..., ::-1], ROOM[0].depth[:, 1:]):
-        copy = ahead.pinned(image)
+        copy = ahead.pinned(image, "cuda")
         assert copy is not image
         assert copy.flags.c_contiguous
         assert copy.dtype == image.dtype

@@ -31,19 +31,20 @@ def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -
         if turn:
             frame = prepared(frame, camera, now)
         if device.startswith("cuda"):
-            frame = replace(frame, color=pinned(frame.color), depth=pinned(frame.depth))
+            frame = replace(frame, color=pinned(frame.color, device), depth=pinned(frame.depth, device))
         return frame
 
     return prepare
 
 
-def pinned(array: np.ndarray) -> np.ndarray:
-    """A copy in page-locked memory, or the array itself where there is none to be had. numpy copies alone, torch would
-    wake all its threads in each of the threads that read."""
+def pinned(array: np.ndarray, device: str) -> np.ndarray:
+    """A copy in page-locked memory of ``device``, or the array itself where there is none to be had. numpy copies
+    alone, torch would wake all its threads in each of the threads that read."""
     import torch
 
     try:
-        held = torch.empty(array.nbytes, dtype=torch.uint8, pin_memory=True)
+        with torch.cuda.device(torch.device(device).index or 0):
+            held = torch.empty(array.nbytes, dtype=torch.uint8, pin_memory=True)
     except RuntimeError:
         return array
     copy = held.numpy().view(array.dtype).reshape(array.shape)

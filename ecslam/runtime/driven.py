@@ -14,7 +14,7 @@ from ..types import Frame, InputError, Intrinsics
 
 State = dict[str, NDArray[Any]]
 
-BASE_MB = 900.0  # the library's own share, the fused volume, stored pixels, and what recorded loops keep
+BASE_MB = 1000.0  # the library's own share, the fused volume, stored pixels, and what recorded loops keep
 COPIES = 5  # of what is learnt: itself, its gradient, two moments, a frozen copy
 
 
