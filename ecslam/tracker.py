@@ -26,6 +26,7 @@ from .types import Frame, Intrinsics
 
 LEAST_SEEN = 0.1
 LEAST_POINTS = 64  # that are measured, or a frame is not tracked
+SURELY = 0.9  # of the aligned pose's cost; one that wandered off may cost less by a few percent, as points drop out
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class HostTracker:
         self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep = STILL
     ) -> TrackResult:
         """See ``Tracker``. Direct alignment of points spread over the image, then the paper's rendered tracking; the
-        preset may leave either out. A rendered pose that costs more on the aligned surface is not taken."""
+        preset may leave either out. A rendered pose is taken where it costs ``SURELY`` less on the aligned surface."""
         surface, measured = self.surface, spread_pixels(frame, self.camera, config.align.points, config, self.rng)
         measured = straight_pixels(measured, self.camera, sweep)
         if len(measured.points()) < LEAST_POINTS:
@@ -84,7 +85,7 @@ class HostTracker:
             generator = self.generator or seeded(self.rng, field.device)
             rendered, losses = track_adam(field, self.kernels, pixels, c2w, config, generator, self.recorder)
             before, after = (cost_at(surface, points, pose, config) for pose in (c2w, rendered))
-            if config.align.to == "none" or after <= before:
+            if config.align.to == "none" or after < SURELY * before:
                 c2w = rendered
         return TrackResult(c2w, losses, fit(surface, measured, c2w, config.truncation_m))
 

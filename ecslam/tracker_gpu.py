@@ -29,7 +29,7 @@ from .pose_adam import pose_rates
 from .rays import kernel_weights, make_rays
 from .samples import uniform
 from .shutter import STILL, Sweep
-from .tracker import LEAST_POINTS, LEAST_SEEN, TrackResult, descend_rendered
+from .tracker import LEAST_POINTS, LEAST_SEEN, SURELY, TrackResult, descend_rendered
 from .types import Frame, Intrinsics
 from .volume_gpu import GpuVolume
 
@@ -95,8 +95,8 @@ class GpuTracker:
             pixels = choose(frame, self.camera, config, corners, order, jitter[:, :3], self.observed, aligned)
             pixels = straight_pixels(pixels, self.camera, sweep) if rolling else pixels
             rendered, terms = self._rendered(field, config, pixels, aligned, rates, jitter[:, 3:])
-            worse = _objective(blocks, packed, rendered, row[COUNT.value], settings[-1]) > cost
-            pose = torch.where(worse, aligned, rendered)
+            better = _objective(blocks, packed, rendered, row[COUNT.value], settings[-1]) < SURELY * cost
+            pose = torch.where(better, rendered, aligned)
         told = tracking_gpu.told(blocks, points, pose, row, 0.5 * config.truncation_m, LEAST_SEEN)
         return (torch.cat([told, terms.double()]) if len(terms) else told,)
 

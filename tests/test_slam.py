@@ -41,6 +41,20 @@ def test_a_rendered_pose_that_the_volume_contradicts_is_not_taken(monkeypatch, t
     assert off < 0.005 if to == "fused" else off == pytest.approx(0.01 * 3**0.5)
 
 
+@pytest.mark.parametrize(("share", "taken"), [(0.95, False), (0.85, True)])
+def test_a_rendered_pose_must_fit_the_volume_clearly_better(monkeypatch, share, taken):
+    room = open_sequence("synthetic/studio?size=160x120&frames=600")
+    engine = Slam(apply_settings(load_preset("lite"), SMALL), room.intrinsics, first_pose=room[0].c2w_gt)
+    engine.step(room[0])
+    other = np.array(room[1].c2w_gt)
+    other[:3, 3] += 0.001
+    costs = iter([1.0, share])
+    monkeypatch.setattr(tracker, "cost_at", lambda *_: next(costs))
+    monkeypatch.setattr(tracker, "track_adam", lambda *_: (other, {}))
+    engine.step(room[1])
+    assert np.allclose(engine.trajectory[1], other) == taken
+
+
 def test_something_must_track():
     room = open_sequence("synthetic/studio?size=160x120&frames=14")
     engine = Slam(apply_settings(load_preset("lite"), ["align.to=none"]), room.intrinsics)
