@@ -14,6 +14,7 @@ from .field import TsdfField
 from .kernels import Backend
 from .kernels.graphs import Recorder
 from .keyframes import Keyframe
+from .movers import Movers
 from .observed import ObservedVoxels
 from .observed_gpu import ObservedTable
 from .recovery import SUDDEN_DEG, SUDDEN_M, Recovery, around, best_start, near
@@ -51,6 +52,7 @@ class Follower:
         self._generator = generator if device.type == "cpu" else None
         self.recorder = Recorder(plain=kernels_name != "gpu")
         self.recovery = Recovery()
+        self._movers = Movers(camera)
         lengths, fused = (config.align.voxel_m, config.truncation_m), config.align.to == "fused"
         self._volume = create_volume(kernels_name, *lengths, device, self.recorder) if fused else None
         self._observed: ObservedVoxels | ObservedTable = ObservedVoxels()
@@ -66,6 +68,16 @@ class Follower:
         assert not isinstance(self._volume, FusedVolume | None)
         return GpuTracker(self._camera, self._volume, observed, self._kernels, generator, self.recorder)
 
+    def still(self, frame: Frame, trajectory: Trajectory, config: Config) -> Frame:
+        """The frame after ``trajectory`` without what moves by itself, where it is known what was there before."""
+        if config.movers or self.recovery.lost or self._after_gap(frame, trajectory):
+            return frame
+        return self._movers.without(frame, trajectory.predict(frame.timestamp), trajectory.keyframe_poses())
+
+    def remember(self, frame: Frame, keyframe: int) -> None:
+        """Keep what a frame saw that became the keyframe number ``keyframe``: what is new there later has come."""
+        self._movers.remember(frame, keyframe)
+
     def follow(
         self, frame: Frame, trajectory: Trajectory, keyframes: list[Keyframe], field: TsdfField, config: Config
     ) -> TrackResult:
@@ -74,13 +86,16 @@ class Follower:
         if config.tracking.iterations > 0 or self._volume is None:
             self._observe(trajectory, keyframes)
         surface, tracker = self._tracker(field, config)
-        last, gap = trajectory[-1], frame.timestamp - trajectory.timestamps[-1] > GAP_S
+        last, gap = trajectory[-1], self._after_gap(frame, trajectory)
         guess = last if self.recovery.lost or gap else trajectory.predict(frame.timestamp)
         sweep = STILL if self.recovery.lost or gap else self.sweep(trajectory, config)
         starts = around(guess) if gap else [guess]
         track = best_start(lambda start: tracker.track(frame, start, field, config, sweep), starts)
         elsewhere = Relocalisation(frame, self._camera, surface, trajectory, keyframes, config, self._rng)
         return self.recovery.judge(track, last, elsewhere, gap)
+
+    def _after_gap(self, frame: Frame, trajectory: Trajectory) -> bool:
+        return frame.timestamp - trajectory.timestamps[-1] > GAP_S
 
     def sweep(self, trajectory: Trajectory, config: Config) -> Sweep:
         """How the camera moves while an image is read, if it moves as in the last frames of ``trajectory`` (see
@@ -120,6 +135,7 @@ class Follower:
         return {
             **prefixed("observed", self._observed.state() | {"trained": np.array(self._trusted)}),
             **prefixed("volume", self._volume.state() if self._volume is not None else {}),
+            **prefixed("movers", self._movers.state()),
             "lost": self.recovery.state(),
         }
 
@@ -129,4 +145,5 @@ class Follower:
         self._trusted = int(state["observed.trained"])
         if self._volume is not None:
             self._volume.load(part("volume", state))
+        self._movers.load(part("movers", state))
         self.recovery.load(state["lost"])

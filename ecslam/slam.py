@@ -28,6 +28,7 @@ from .keyframes import Keyframe, Shelf, make_keyframe, surface_points
 from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
 from .messages import LoopEvent, StepReport
+from .movers import MOVING
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .scene_box import SceneBox
 from .shutter import STILL
@@ -94,7 +95,7 @@ class Slam:
         self._stream = torch.cuda.Stream(self.device) if self._pool and self.device.type == "cuda" else None
         self._landed = Landed()
         self._frozen: TsdfField | None = None
-        self._note, self._graphs_failed = "", False
+        self._note, self._graphs_failed, self._moving = "", False, False
 
     # ---- one frame --------------------------------------------------------------------------------------------------
 
@@ -106,6 +107,10 @@ class Slam:
             return self._first_frame(frame, interrupt)
         started = time.perf_counter()
         self._apply_pending(block=False)
+        seen, frame = frame, self._follower.still(frame, self.trajectory, self.config)
+        if frame is not seen and not self._moving:
+            self._note = MOVING
+        self._moving = frame is not seen
         track = self._follower.follow(frame, self.trajectory, self.keyframes, self._require_field(), self.config)
         index, recovery = len(self.trajectory), self._follower.recovery
         keyframe = index % self.config.keyframe_every == 0 and not recovery.missed
@@ -117,6 +122,7 @@ class Slam:
         if keyframe:
             keyframe_now = make_keyframe(frame, self.intrinsics, self.config)
             self.keyframes.append(self._shelf.keep(keyframe_now.straight(self.intrinsics, sweep)))
+            self._follower.remember(frame, len(self.keyframes) - 1)
         if keyframe and self._mapping_is_due():
             waited_s = self._apply_pending(block=True)
             loop = self._map(frame.index, interrupt)
@@ -159,6 +165,7 @@ class Slam:
         self._apply(mapped)
         self._landed = Landed()
         self._follower.fuse(frame, self.trajectory[-1], STILL, self.config)
+        self._follower.remember(frame, 0)
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,

@@ -26,6 +26,7 @@ LAYERS = (
     (
         "datasets",
         "denoising",
+        "movers",
         "pixels",
         "pixels_gpu",
         "shutter",

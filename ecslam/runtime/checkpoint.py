@@ -23,7 +23,7 @@ from ..atomic import write_atomic
 from ..types import InputError
 from .files import to_json
 
-VERSION = 6
+VERSION = 7
 GENERATIONS = 2
 MAX_MANIFEST_BYTES = 16 << 20
 LASTING = "keyframes."

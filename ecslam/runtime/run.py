@@ -18,6 +18,7 @@ from ..datasets.views import in_order, problems
 from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
 from ..messages import Event, LoopEvent, Notice, StepReport
+from ..movers import MOVING
 from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint
@@ -37,7 +38,7 @@ THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
 SAME = 1e-6
-GOOD_NEWS = ("relocalised", "recovered")
+GOOD_NEWS = ("relocalised", "recovered", MOVING)
 
 
 @dataclass(frozen=True)
