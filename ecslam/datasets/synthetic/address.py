@@ -12,12 +12,14 @@ ROOMS = ("studio", "apartment", "corridor")
 PREFIX = "synthetic/"
 MAX_SIDE, MAX_FRAMES = 4096, 100_000
 MOST_READOUT_S = 1 / 30
+SWITCH = {"0": False, "1": True}
+FORMS = "noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1"
 
 
 @dataclass(frozen=True)
 class Address:
     """Which room to render and how. frames: None for one round of the room's path. width, height: pixels. readout:
-    seconds from an image's first row to its last (a rolling shutter)."""
+    seconds from an image's first row to its last (a rolling shutter). visitor: whether somebody walks through."""
 
     room: str
     width: int = 640
@@ -26,13 +28,14 @@ class Address:
     noise: bool = False
     seed: int = 0
     readout: float = 0.0
+    visitor: bool = False
 
 
 def parse_address(address: str, defaults: Address | None = None) -> Address:
     """Read a room's name, with or without ``synthetic/`` and with options after ``?`` that override ``defaults``.
 
-    Options: noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS. Raises InputError for an unknown room, an unknown
-    option or a value out of range.
+    Options: noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1. Raises InputError for an unknown room,
+    an unknown option or a value out of range.
     """
     name, _, query = address.removeprefix(PREFIX).partition("?")
     if name not in ROOMS:
@@ -64,7 +67,9 @@ def check(address: Address) -> Address:
 def _apply(address: Address, key: str, value: str, source: str) -> Address:
     try:
         if key == "noise":
-            return replace(address, noise={"0": False, "1": True}[value])
+            return replace(address, noise=SWITCH[value])
+        if key == "visitor":
+            return replace(address, visitor=SWITCH[value])
         if key == "frames":
             return replace(address, frames=int(value))
         if key == "seed":
@@ -75,7 +80,5 @@ def _apply(address: Address, key: str, value: str, source: str) -> Address:
             width, height = value.split("x")
             return replace(address, width=int(width), height=int(height))
     except (ValueError, KeyError):
-        raise InputError(
-            f"{source}: cannot read {key}={value}; write noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS"
-        ) from None
-    raise InputError(f"{source}: unknown option {key!r}; the options are noise, frames, size, seed and readout")
+        raise InputError(f"{source}: cannot read {key}={value}; write {FORMS}") from None
+    raise InputError(f"{source}: unknown option {key!r}; the options are {FORMS}")

@@ -23,6 +23,7 @@ from .render import render
 from .rooms import Room
 from .scene import Scene, pack
 from .store import kept
+from .visitor import standing, with_visitor
 
 RATE_HZ = 30.0
 FOCAL = 0.8
@@ -60,14 +61,15 @@ def open_synthetic(
     noise: bool = False,
     seed: int = 0,
     readout: float = 0.0,
+    visitor: bool = False,
 ) -> SyntheticSequence:
     """Open a built-in room: ``studio``, ``apartment`` or ``corridor``, also as an address with options (see address).
 
     The camera's path is closed: ``frames`` beyond one round (the default) go round again. ``noise`` imitates a Kinect;
-    ``seed`` changes that noise and nothing else; ``readout``: see ``Address``. Raises InputError for an
+    ``seed`` changes that noise and nothing else; ``readout``, ``visitor``: see ``Address``. Raises InputError for an
     unknown room or values out of range.
     """
-    defaults = check(Address("studio", width, height, frames, noise, seed, readout))
+    defaults = check(Address("studio", width, height, frames, noise, seed, readout, visitor))
     return SyntheticSequence(parse_address(name, defaults))
 
 
@@ -98,6 +100,9 @@ class SyntheticSequence:
             raise IndexError(f"frame {index} of {len(self)}")
         c2w = self._round[index % len(self._round)]
         color, depth = self._look(index) if self.address.readout else self._seen(self.intrinsics, c2w)
+        feet = standing(index, self._round, room(self.address.room).interior[0, 2]) if self.address.visitor else None
+        if feet is not None:
+            color, depth = with_visitor(color, depth, self.intrinsics, c2w, feet)
         if self.address.noise:
             color, depth = kinect(color, depth, self.intrinsics, np.random.default_rng([self.address.seed, index]))
         return Frame(index, index / RATE_HZ, color, depth, c2w.copy())
