@@ -17,7 +17,7 @@ from ecslam.commands import progress_line
 from ecslam.config_files import load_config, load_preset
 from ecslam.evaluation.trajectory import absolute_error
 from ecslam.evaluation.trajectory_io import format_tum
-from ecslam.messages import Notice, State, Stop
+from ecslam.messages import Notice, Quit, State, Stop
 from ecslam.runtime import engine as module
 from ecslam.runtime.driven import estimate_mb
 from ecslam.runtime.engine import Engine
@@ -393,6 +393,16 @@ def test_resume_notes_where_the_sequence_has_moved(tmp_path):
     Engine.resume(tmp_path, sequence=moved, make=maker()).run()
     assert json.loads((tmp_path / "run.json").read_text())["sequence"] == "moved"
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 30
+
+
+def test_resume_drops_the_mesh_and_the_picture_of_the_frames_before(tmp_path):
+    interrupted(tmp_path)
+    for name in ("mesh.ply", "picture.png"):
+        (tmp_path / name).write_text("of 12 frames")
+    resumed = Engine.resume(tmp_path, sequence=FakeSequence(30), make=maker())
+    resumed.submit(Quit())
+    resumed.run()
+    assert not any((tmp_path / name).exists() for name in ("mesh.ply", "picture.png"))
 
 
 @pytest.mark.parametrize(

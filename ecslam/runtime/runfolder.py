@@ -41,7 +41,8 @@ from .folderlock import claim
 NEEDED_MB = 500.0
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 LOGS = ("metrics.jsonl", "events.jsonl", "keyframes.jsonl")
-FILES = ("run.json", "config.yaml", "trajectory.txt", "groundtruth.txt", "mesh.ply", "summary.json", "picture.png")
+DERIVED = ("mesh.ply", "summary.json", "picture.png")
+FILES = ("run.json", "config.yaml", "trajectory.txt", "groundtruth.txt", *DERIVED)
 FOLDERS = ("thumbnails", "meshes", "checkpoints")
 
 
@@ -77,9 +78,11 @@ class RunFolder:
         return cls(path, problem, claim(path))
 
     def go_on(self, position: int) -> None:
-        """Begin to log from frame ``position`` on: what was logged for it and later frames is dropped."""
+        """Begin to log from frame ``position`` on: what was logged for it and later frames is dropped, and what was
+        made of the run as it stood then."""
         remove_temporaries(self.path)
-        (self.path / "summary.json").unlink(missing_ok=True)
+        for name in DERIVED:
+            (self.path / name).unlink(missing_ok=True)
         for name in ("thumbnails", "meshes"):
             (self.path / name).mkdir(exist_ok=True)
         for name in LOGS:
