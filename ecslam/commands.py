@@ -23,7 +23,7 @@ from .datasets.meshes import NoSurface
 from .datasets.roots import sequences_under
 from .evaluation.trajectory_io import read_tum
 from .messages import Notice, Quit, Snapshot, State
-from .runtime.checkpoint import load_checkpoint
+from .runtime.checkpoint import load_checkpoint, newest_frame
 from .runtime.driven import estimate_mb, import_slam
 from .runtime.engine import Engine
 from .runtime.files import beside, require_place, to_json
@@ -39,6 +39,7 @@ FIGURES = (
     "sequence", "preset", "kernels", "frames", "fps_wall", "ate_rmse_cm", "loop_closures", "skipped_frames",
     "lost_frames",
 )  # fmt: skip
+FINAL = ("trajectory.txt", "checkpoints", "mesh.ply", "summary.json")
 BUILT_IN = ("synthetic/studio", "synthetic/apartment", "synthetic/corridor")
 IN_A_TERMINAL = ("www-browser", "links", "elinks", "lynx", "w3m")
 
@@ -274,7 +275,7 @@ class Reports:
 
 def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     """Draw the picture of the run, print its figures and where they lie, and how to get a mesh that it lacks. A picture
-    that fails is a warning."""
+    that fails is a warning. Raises InputError when what a run is for could not be saved."""
     picture = None
     try:
         picture = draw_picture(folder)
@@ -290,9 +291,23 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     for note in (summary["kernels_note"], *(f"{name} not saved ({why})" for name, why in summary["not_saved"].items())):
         if note:
             console.print(f"  note: {note}", soft_wrap=True)
+    saved, done = newest_frame(folder / "checkpoints"), summary["frames"] + summary["skipped_frames"]
+    if saved < done:
+        console.print(f"  note: the newest checkpoint holds {saved} of the {done} frames done", soft_wrap=True)
     if not (folder / "mesh.ply").is_file():
         text = f"  no mesh.ply yet: ecslam mesh {folder} makes it, or ecslam resume {folder} goes on with the run"
         console.print(text, soft_wrap=True)
+    _require_saved(folder, summary["not_saved"])
+
+
+def _require_saved(folder: Path, not_saved: dict[str, str]) -> None:
+    """Raises InputError when something of ``FINAL`` is among what could not be saved."""
+    lacking = [name for name in FINAL if name in not_saved]
+    if lacking:
+        raise InputError(
+            f"{folder}: {', '.join(lacking)} could not be saved ({not_saved[lacking[0]]}); make room, then: "
+            f"ecslam {'mesh' if lacking == ['mesh.ply'] else 'resume'} {folder}"
+        )
 
 
 def draw_picture(folder: Path) -> Path | None:

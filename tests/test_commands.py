@@ -1,5 +1,8 @@
 """What the command line says while the dashboard is up."""
 
+import errno
+import os
+import re
 import threading
 import webbrowser
 from types import SimpleNamespace
@@ -11,7 +14,8 @@ from fake_slam import Behaviour, FakeSequence
 from runtime_watch import running
 
 from ecslam import commands
-from ecslam.messages import Quit, Restart, State
+from ecslam.messages import Quit, Restart, Resume, State
+from ecslam.types import InputError
 
 
 def test_every_run_is_reported_once_as_soon_as_it_is_over(tmp_path, monkeypatch):
@@ -42,6 +46,25 @@ def test_a_run_that_was_left_early_says_how_to_get_its_mesh(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert f"ecslam mesh {tmp_path / 'r'} makes it" in said
     assert f"ecslam resume {tmp_path / 'r'} goes on" in said
+
+
+def test_results_lost_to_a_full_disk_are_an_error(tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with running(tmp_path / "r", paused_at=6) as (engine, watch, _):
+        for thread in threading.enumerate():
+            if thread.name == "checkpoint":
+                thread.join()
+        monkeypatch.setattr(os, "fsync", full)
+        watch.go(Resume(), State.FINISHED)
+        with pytest.raises(InputError) as lost:
+            commands.finish_run(engine.run_folder, engine.summary)
+    assert str(lost.value) == (
+        f"{tmp_path / 'r'}: trajectory.txt, checkpoints, mesh.ply, summary.json could not be saved "
+        f"(No space left on device); make room, then: ecslam resume {tmp_path / 'r'}"
+    )
+    assert re.search(r"the newest checkpoint holds [1-6] of the 30 frames done", capsys.readouterr().out)
 
 
 def test_the_port_that_was_found_free_is_the_one_that_the_page_has(tmp_path):

@@ -86,6 +86,11 @@ def load_checkpoint(folder: Path) -> Checkpoint:
     raise InputError(f"{folder}: no usable checkpoint ({found}); start the run again with ecslam run")
 
 
+def newest_frame(folder: Path) -> int:
+    """How many frames the newest generation in a run's folder of checkpoints holds, by its name; 0 without any."""
+    return int(next((path.stem for path in _generations(folder)), "0"))
+
+
 def _write(folder: Path, arrays: Arrays) -> str:
     """Save arrays in a file of their own; its digest."""
     data = safetensors.numpy.save({name: np.require(value, requirements="C") for name, value in arrays.items()})

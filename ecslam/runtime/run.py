@@ -386,11 +386,12 @@ class Run:
         return counted
 
     def close(self, export_s: float) -> dict[str, Any]:
-        """Write ``summary.json`` and close the logs; the summary comes back. ``end`` has been called before."""
+        """Write ``summary.json`` and close the logs; the summary comes back, and says too where that failed. ``end``
+        has been called before."""
         summary = summarise(self, export_s)
         self.folder.write("summary.json", summary)
         self.folder.close()
-        return summary
+        return summary | {"not_saved": dict(self.folder.not_saved)}
 
 
 def _known(truth: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
