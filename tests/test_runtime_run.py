@@ -395,6 +395,14 @@ def test_resume_notes_where_the_sequence_has_moved(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 30
 
 
+def test_resume_knows_the_error_so_far(tmp_path):
+    interrupted(tmp_path)
+    seen = []
+    Engine.resume(tmp_path, sequence=FakeSequence(30), make=maker()).run(seen.append)
+    assert seen[0].ate_cm > 0
+    assert all(line["ate_cm"] for line in read_lines(tmp_path / "metrics.jsonl") if line["frame"] >= 12)
+
+
 def test_resume_drops_the_mesh_and_the_picture_of_the_frames_before(tmp_path):
     interrupted(tmp_path)
     for name in ("mesh.ply", "picture.png"):

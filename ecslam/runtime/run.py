@@ -98,6 +98,7 @@ class Run:
             folder.go_on(resumed.frame)
             folder.write("run.json", about | {"sequence": plan.address})
             self.loops = folder.loops()
+            self.measure()
         else:
             self._describe()
 
