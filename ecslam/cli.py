@@ -233,12 +233,14 @@ def bench_speed(
 ) -> None:
     """Frames per second, all included; time per stage; growth of cost and memory; a rival beside it."""
     from . import commands
+    from .bench.runs import require_a_run
     from .bench.speed import bench_speed, plot_speed, print_table
 
     names = [name.strip() for name in presets.split(",")]
     result = bench_speed(sequence, names, frames, repeats, commands.pick_device(device), peer)
     print_table(result)
     commands.write_json(json, result)
+    require_a_run([result["errors"][name] for name in names], repeats)
     if plot is not None:
         plot_speed(result, plot)
 
@@ -276,7 +278,8 @@ def bench_accuracy(
 ) -> None:
     """Trajectory and surface against the ground truth, mean and deviation over seeds; the paper's ablation."""
     from . import commands
-    from .bench.accuracy import bench_accuracy, print_table
+    from .bench.accuracy import bench_accuracy, errors, print_table
+    from .bench.runs import require_a_run
 
     names = [name.strip() for name in presets.split(",")]
     result = bench_accuracy(
@@ -291,6 +294,7 @@ def bench_accuracy(
     )
     print_table(result)
     commands.write_json(json, result)
+    require_a_run(list(errors(result).values()), seeds)
 
 
 def resolve_config(

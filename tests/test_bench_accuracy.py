@@ -43,13 +43,14 @@ def test_a_tiny_ablation(tmp_path):
 def test_means_deviations_and_failures_are_shown():
     runs = [{"ate_rmse_cm": 1.0}, {"ate_rmse_cm": 3.0}, {"error": "the map exploded"}]
     other = [{"ate_rmse_cm": 5.0, "depth_l1_cm": 0.75}]
-    about = {"sequence": "a", "frames": "0:9", "settings": ["fus=false"], "seeds": 3}
+    about = {"sequence": "a", "frames": "", "settings": ["fus=false"], "seeds": 3}
     text = io.StringIO()
     accuracy.print_table(about | {"variants": {"lite": runs, "full": other}}, Console(file=text, width=100))
     assert re.search(r"ATE RMSE \(cm\) +│ +2\.00 ± 1\.41 │ +5\.00", text.getvalue())
     assert re.search(r"Depth L1 \(cm\) +│ +│ +0\.75", text.getvalue())
     assert re.search(r"failed runs +│ +1 │ +0", text.getvalue())
-    assert "fus=false" in text.getvalue()
+    assert "a, fus=false, seeds: 3" in text.getvalue()
+    assert "lite: 1 of 3 runs failed, the first because: the map exploded" in text.getvalue()
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ import pytest
 import torch
 
 from ecslam import cli, commands
+from ecslam.bench import accuracy, speed
 from ecslam.commands import draw_picture
 from ecslam.config_files import apply_settings, load_config, load_preset
 from ecslam.datasets.meshes import load_mesh
@@ -404,6 +405,21 @@ def test_unknown_rooms_and_mesh_formats(finished, tmp_path):
 def test_where_results_cannot_go_is_found_before_a_benchmark_runs(tmp_path, words):
     assert_refused(ecslam("bench", *words, tmp_path / "none/x"), f"{words[1]} {tmp_path / 'none/x'}", "no folder")
     assert_refused(ecslam("bench", *words, tmp_path), f"{words[1]} {tmp_path}: a folder", "name of a file")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"), [(["speed", "--repeats", 2], "live, lite"), (["accuracy", "--seeds", 2], "lite")]
+)
+def test_a_benchmark_without_a_run_that_works_is_an_error(tmp_path, monkeypatch, words, named):
+    for module in (accuracy, speed):
+        monkeypatch.setattr(module, "in_own_process", lambda *_: {"error": "the map exploded"})
+    done = ecslam("bench", *words, "--device", "cpu", "--json", tmp_path / "figures.json")
+    assert done.code == 2
+    assert "error: every run failed" in done.err
+    assert done.out.splitlines() == [
+        f"{name}: 2 of 2 runs failed, the first because: the map exploded" for name in named.split(", ")
+    ]
+    assert "the map exploded" in (tmp_path / "figures.json").read_text()
 
 
 def test_a_mesh_for_a_folder_that_takes_no_files_is_refused_before_it_is_made(finished, tmp_path, monkeypatch):

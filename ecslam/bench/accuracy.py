@@ -15,7 +15,7 @@ from ..datasets import open_sequence, select_frames
 from ..runtime.engine import Engine
 from ..runtime.judge import judge_run
 from ..types import InputError
-from .runs import Figures, in_own_process, preset_config, progress, say
+from .runs import Figures, in_own_process, on_frames, preset_config, print_failures, progress, say
 
 ABLATED: dict[str, tuple[str, ...]] = {
     "": (),
@@ -88,10 +88,11 @@ def measure(
 
 
 def print_table(result: Figures, console: Console | None = None) -> None:
-    """A column for each variant, a line for each figure: mean and, of several seeds, standard deviation."""
+    """A column for each variant, a line for each figure: mean and, of several seeds, standard deviation; below it what
+    failed."""
     console = console or Console()
     settings = "".join(f", {setting}" for setting in result["settings"])
-    table = Table(title=f"{result['sequence']} {result['frames']}{settings}, seeds: {result['seeds']}")
+    table = Table(title=f"{on_frames(result['sequence'], result['frames'])}{settings}, seeds: {result['seeds']}")
     table.add_column("")
     for name in result["variants"]:
         table.add_column(name, justify="right", overflow="fold")
@@ -99,10 +100,17 @@ def print_table(result: Figures, console: Console | None = None) -> None:
         cells = [_cell([run.get(key) for run in runs]) for runs in result["variants"].values()]
         if any(cells):
             table.add_row(label, *cells)
-    failed = [sum("error" in run for run in runs) for runs in result["variants"].values()]
-    if any(failed):
-        table.add_row("failed runs", *map(str, failed))
-    console.print(table)
+    failed = errors(result)
+    if any(failed.values()):
+        table.add_row("failed runs", *(str(len(found)) for found in failed.values()))
+    if any(len(found) < result["seeds"] for found in failed.values()):
+        console.print(table)
+    print_failures(console, failed, result["seeds"])
+
+
+def errors(result: Figures) -> dict[str, list[str]]:
+    """What ended the runs of each variant that failed."""
+    return {name: [run["error"] for run in runs if "error" in run] for name, runs in result["variants"].items()}
 
 
 def _cell(values: list[float | None]) -> str:

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from ..config import Config
 from ..config_files import for_layout, load_config, load_preset
 from ..messages import Snapshot
-from ..types import Sequence, words
+from ..types import InputError, Sequence, words
 
 Figures = dict[str, Any]
 
@@ -52,3 +52,22 @@ def progress(name: str) -> Iterator[Callable[[Snapshot], None]]:
 def say(text: str) -> None:
     """A line on stderr."""
     Console(stderr=True).print(text, highlight=False)
+
+
+def on_frames(sequence: str, frames: str) -> str:
+    """What was run, for the title of a table."""
+    return f"{sequence} {frames}".rstrip()
+
+
+def print_failures(console: Console, errors: dict[str, list[str]], runs: int) -> None:
+    """A line for each name of whose ``runs`` some failed."""
+    for name, found in errors.items():
+        if found:
+            text = f"{name}: {len(found)} of {runs} runs failed, the first because: {found[0]}"
+            console.print(text, soft_wrap=True, markup=False)
+
+
+def require_a_run(errors: list[list[str]], runs: int) -> None:
+    """Raises InputError when there are no figures: all ``runs`` of everything ended in ``errors``."""
+    if all(len(found) == runs for found in errors):
+        raise InputError("every run failed, so there is nothing to compare; the lines above say why")

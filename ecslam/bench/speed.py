@@ -22,7 +22,7 @@ from ..runtime.checkpoint import load_checkpoint
 from ..runtime.engine import Engine
 from ..runtime.memory import resident_mb
 from .peer import measure_open3d, open3d_missing
-from .runs import in_own_process, preset_config, progress, say
+from .runs import in_own_process, on_frames, preset_config, print_failures, progress, say
 
 SPAN = 200
 SMOOTH = 25
@@ -131,9 +131,9 @@ def measure(sequence: str, preset: str, frames: str, device: str) -> Figures:
 
 
 def print_table(result: Figures, console: Console | None = None) -> None:
-    """A column for each preset and for the rival, a line for each figure."""
+    """A column for each preset and for the rival, a line for each figure; below it what failed."""
     console = console or Console()
-    title = f"{result['sequence']} {result['frames']}, {result['machine']}, medians of {result['repeats']}"
+    title = f"{on_frames(result['sequence'], result['frames'])}, {result['machine']}, medians of {result['repeats']}"
     columns = result["presets"] | ({PEER: result["peer"]} if result["peer"] else {})
     table = Table(title=title)
     table.add_column("")
@@ -145,11 +145,9 @@ def print_table(result: Figures, console: Console | None = None) -> None:
             table.add_row(label, *cells)
     if result["ratio"]:
         table.add_row("times the rival's frames/s", *(_cell(result["ratio"].get(name)) for name in columns))
-    console.print(table)
-    for name, errors in result["errors"].items():
-        if errors:
-            text = f"{name}: {len(errors)} of {result['repeats']} runs failed, the first because: {errors[0]}"
-            console.print(text, soft_wrap=True, markup=False)
+    if columns:
+        console.print(table)
+    print_failures(console, result["errors"], result["repeats"])
     if result["peer_note"]:
         console.print(result["peer_note"])
 
