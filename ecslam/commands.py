@@ -292,21 +292,24 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
         if note:
             console.print(f"  note: {note}", soft_wrap=True)
     saved, done = newest_frame(folder / "checkpoints"), summary["frames"] + summary["skipped_frames"]
-    if saved < done:
+    if 0 < saved < done:
         console.print(f"  note: the newest checkpoint holds {saved} of the {done} frames done", soft_wrap=True)
     if not (folder / "mesh.ply").is_file():
         text = f"  no mesh.ply yet: ecslam mesh {folder} makes it, or ecslam resume {folder} goes on with the run"
+        if not saved:
+            text = "  no mesh.ply and no checkpoint yet, so there is nothing to go on from: start again with ecslam run"
         console.print(text, soft_wrap=True)
-    _require_saved(folder, summary["not_saved"])
+    _require_saved(folder, summary["not_saved"], bool(saved))
 
 
-def _require_saved(folder: Path, not_saved: dict[str, str]) -> None:
-    """Raises InputError when something of ``FINAL`` is among what could not be saved."""
+def _require_saved(folder: Path, not_saved: dict[str, str], to_go_on: bool) -> None:
+    """Raises InputError when something of ``FINAL`` is among what could not be saved. to_go_on: whether there is a
+    checkpoint."""
     lacking = [name for name in FINAL if name in not_saved]
     if lacking:
+        onward = f"ecslam {'mesh' if lacking == ['mesh.ply'] else 'resume'} {folder}" if to_go_on else "ecslam run"
         raise InputError(
-            f"{folder}: {', '.join(lacking)} could not be saved ({not_saved[lacking[0]]}); make room, then: "
-            f"ecslam {'mesh' if lacking == ['mesh.ply'] else 'resume'} {folder}"
+            f"{folder}: {', '.join(lacking)} could not be saved ({not_saved[lacking[0]]}); make room, then: {onward}"
         )
 
 

@@ -48,6 +48,16 @@ def test_a_run_that_was_left_early_says_how_to_get_its_mesh(tmp_path, capsys):
     assert f"ecslam resume {tmp_path / 'r'} goes on" in said
 
 
+def test_a_run_that_was_left_before_its_first_checkpoint_is_to_be_started_again(tmp_path, capsys):
+    with running(tmp_path / "r", paused_at=0) as (engine, _, __):
+        engine.submit(Quit())
+        assert engine.join(10)
+        commands.finish_run(engine.run_folder, engine.summary)
+    said = capsys.readouterr().out
+    assert "nothing to go on from: start again with ecslam run" in said
+    assert not any(command in said for command in ("ecslam mesh", "ecslam resume"))
+
+
 def test_results_lost_to_a_full_disk_are_an_error(tmp_path, monkeypatch, capsys):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
