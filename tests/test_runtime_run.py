@@ -328,6 +328,19 @@ def test_being_lost_is_said_once_and_marks_the_poses(tmp_path):
     assert [m["tracked"] for m in metrics] == [not m["lost"] for m in metrics]
 
 
+class Blinded(FakeSequence):
+    """Frame 6 has no depth."""
+
+    def __getitem__(self, index: int):
+        frame = super().__getitem__(index)
+        return replace(frame, depth=np.zeros_like(frame.depth)) if index == 6 else frame
+
+
+def test_a_frame_that_is_missed_for_want_of_depth_says_so(tmp_path):
+    summary = run(tmp_path, Blinded(12), Behaviour(lost=(6, 9)))
+    assert summary["warnings"] == ["frame 6: lost (0.0% of the image has usable depth)", "frame 9: lost"]
+
+
 def test_why_no_frame_could_be_used(tmp_path):
     with pytest.raises(
         InputError, match=r"none of 4 frames could be used, the first because: frame 0: no usable depth"

@@ -21,6 +21,7 @@ from .views import GAP_S, problems
 USUAL_DEPTH_M = (0.2, 10.0)
 MOST_WITHOUT_DEPTH = 0.6
 MOST_LEFT_OUT = 0.5
+HARDLY_ANY = 0.05
 BLACK = 4.0  # mean colour value
 JUMP_M, JUMP_DEG, JUMP_RATIO = 0.3, 30.0, 10.0
 
@@ -242,6 +243,12 @@ def odd_depth(depth: NDArray[np.float32], used_m: tuple[float, float]) -> str:
     if not len(known):
         return "no depth at all"
     return _odd_distance(float(np.median(known)), *_left_out(known, used_m), used_m)
+
+
+def lacking_depth(depth: NDArray[np.float32], used_m: tuple[float, float]) -> str:
+    """How little of a frame's depth [H, W] in metres is within ``used_m``, or "" where it is more than hardly any."""
+    share = float(((depth > 0) & (depth >= used_m[0]) & (depth <= used_m[1])).mean())
+    return f"{share:.1%} of the image has usable depth" if share < HARDLY_ANY else ""
 
 
 def _odd_distance(median_m: float, too_near: float, too_far: float, used_m: tuple[float, float]) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .. import config_files
 from ..config import Config
-from ..datasets.check import odd_depth
+from ..datasets.check import lacking_depth, odd_depth
 from ..datasets.views import in_order, problems
 from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
@@ -159,10 +159,8 @@ class Run:
         if not self._in_order[index]:
             self._skip(index, f"frame {index} is not in the order of time ({item.timestamp:.6f} s)")
             return None
-        if self._color is None:
-            used_m = self.config.depth_near_m, self.config.depth_far_m
-            if odd := odd_depth(item.depth, used_m):
-                self.warn(odd, index)
+        if self._color is None and (odd := odd_depth(item.depth, self._used_m)):
+            self.warn(odd, index)
         self._color = item.color
         try:
             report = self._step(item, interrupt)
@@ -247,13 +245,18 @@ class Run:
         if report.note in GOOD_NEWS:
             self.notice("info", report.note, report.frame)
         elif report.note and self.lost_for <= 1:
-            self.warn(report.note, report.frame)
+            lacking = "" if report.tracked else lacking_depth(frame.depth, self._used_m)
+            self.warn(f"{report.note} ({lacking})" if lacking else report.note, report.frame)
         if self._checkpoints.due(self.tally.position):
             self.checkpoint()
         if self._writing.due():
             self.write_trajectory()
         if self._tidying.due():
             return_holes()
+
+    @property
+    def _used_m(self) -> tuple[float, float]:
+        return self.config.depth_near_m, self.config.depth_far_m
 
     def configure(self, config: Config) -> None:
         """Other tracking and mapping settings from the next frame on; ``config.yaml`` holds the newest ones."""
