@@ -77,6 +77,16 @@ def test_an_unwritable_folder_and_a_full_disk_are_one_clear_line(tmp_path, monke
         require_space(tmp_path / "run", 500)
 
 
+def test_to_go_on_takes_less_room_than_to_begin(tmp_path, monkeypatch):
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(900, 423, 477_000_000))
+    with pytest.raises(InputError, match="477 MB free, but a run may need 500 MB"):
+        RunFolder.create(tmp_path, print)
+    RunFolder.reopen(tmp_path, print).close()
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(900, 850, 50_000_000))
+    with pytest.raises(InputError, match="50 MB free, but a run may need 100 MB"):
+        RunFolder.reopen(tmp_path, print)
+
+
 def test_a_folder_with_other_peoples_files_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(InputError, match="holds other files and no run"):

@@ -38,7 +38,7 @@ from ..types import InputError
 from .files import LineLog, keep_lines, read_lines, require_space, to_json
 from .folderlock import claim
 
-NEEDED_MB = 500.0
+NEEDED_MB, NEEDED_TO_GO_ON_MB = 500.0, 100.0
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 LOGS = ("metrics.jsonl", "events.jsonl", "keyframes.jsonl")
 DERIVED = ("mesh.ply", "summary.json", "picture.png")
@@ -73,8 +73,9 @@ class RunFolder:
 
     @classmethod
     def reopen(cls, path: Path, problem: Callable[[str], None]) -> RunFolder:
-        """The folder of a run to resume, which stays as it is until ``go_on``. Raises InputError as ``create`` does."""
-        require_space(path, NEEDED_MB)
+        """The folder of a run to resume, which stays as it is until ``go_on``. Raises InputError as ``create`` does,
+        though less space is enough: most of what a run needs is there already."""
+        require_space(path, NEEDED_TO_GO_ON_MB)
         return cls(path, problem, claim(path))
 
     def go_on(self, position: int) -> None:
