@@ -212,10 +212,10 @@ class Run:
         self.tally.skipped += 1
         self.tally.first_skip = self.tally.first_skip or why
         self.notice("warning", f"skipped: {why}", index)
-        if self.tally.too_many_unreadable:
-            bad = self.tally.unreadable
+        frames, bad = len(self.plan.sequence), self.tally.unreadable
+        if self.tally.too_many_unreadable(frames):
             raise InputError(
-                f"{self.plan.address}: {len(bad)} of {self.tally.position} frames cannot be read, the first being "
+                f"{self.plan.address}: at least {len(bad)} of {frames} frames cannot be read, the first being "
                 f"{bad[0]}; look at it with: ecslam check"
             )
 

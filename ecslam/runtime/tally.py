@@ -11,7 +11,6 @@ import numpy as np
 from ..messages import StepReport
 
 UNREADABLE_SHARE = 0.20
-UNREADABLE_AFTER = 10
 
 
 @dataclass
@@ -48,10 +47,9 @@ class Tally:
         if report.is_keyframe:
             self.keyframes.append(report.frame)
 
-    @property
-    def too_many_unreadable(self) -> bool:
-        """Whether the run is not worth going on with."""
-        return self.position >= UNREADABLE_AFTER and len(self.unreadable) > UNREADABLE_SHARE * self.position
+    def too_many_unreadable(self, frames: int) -> bool:
+        """Whether the run over ``frames`` frames is not worth going on with."""
+        return len(self.unreadable) > UNREADABLE_SHARE * frames
 
     @property
     def fps_wall(self) -> float:
