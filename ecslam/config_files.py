@@ -170,7 +170,9 @@ def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
     for key, value in values.items():
         path = f"{prefix}{key}"
         if key not in by_name:
-            raise InputError(f"{source}: unknown key {path!r}{_suggest(path, _all_keys(Config))}")
+            known = _all_keys(Config)
+            advice = f"; write it as {_nested(path)}" if path in known else _suggest(path, known)
+            raise InputError(f"{source}: unknown key {path!r}{advice}")
         current = getattr(node, key)
         if is_dataclass(current):
             laid[key] = _apply(current, value, source, f"{path}.")
@@ -230,6 +232,12 @@ def _all_keys(node: type, prefix: str = "") -> list[str]:
         if is_dataclass(hints[f.name]):
             keys += _all_keys(hints[f.name], f"{prefix}{f.name}.")
     return keys
+
+
+def _nested(path: str) -> str:
+    """How YAML writes a dotted key that stands for a group and a key of it."""
+    group, _, key = path.partition(".")
+    return f"{group}: {{{_nested(key)}}}" if key else f"{group}: ..."
 
 
 def _suggest(word: str, options: list[str]) -> str:

@@ -104,6 +104,13 @@ def test_a_file_starts_from_the_preset_that_it_names(tmp_path):
     assert load_config(path, full) == wanted
 
 
+def test_a_dotted_key_in_a_file_is_answered_with_how_to_nest_it(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("mapping.iterations: 3")
+    with pytest.raises(InputError, match=r"unknown key 'mapping.iterations'; write it as mapping: {iterations: ...}$"):
+        load_config(path)
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
