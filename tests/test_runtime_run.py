@@ -356,12 +356,25 @@ def test_without_a_true_pose_of_the_first_frame_the_surface_is_not_judged(tmp_pa
     assert "the first frame has no true pose" in told[0]
 
 
-def test_a_path_behind_the_truth_is_told(tmp_path):
-    run(tmp_path, FakeSequence(40))
+def late_run(folder, extent_m: float) -> None:
+    """A run whose path is 30 ms behind its ground truth."""
+    run(folder, FakeSequence(40))
     times, poses = np.arange(90) / 30, np.tile(np.eye(4), (90, 1, 1))
     for name, late_s in (("groundtruth", 0.0), ("trajectory", 0.03)):
-        poses[:, :3, 3] = np.stack([np.sin(times - late_s), np.cos(3 * (times - late_s)), times - late_s], 1)
-        (tmp_path / f"{name}.txt").write_text(format_tum(times, poses))
+        at = times - late_s
+        poses[:, :3, 3] = extent_m * np.stack([np.sin(at), np.cos(3 * at), at], 1)
+        (folder / f"{name}.txt").write_text(format_tum(times, poses))
+
+
+def test_a_lag_that_costs_hardly_any_accuracy_is_not_told(tmp_path):
+    late_run(tmp_path, 0.02)
+    told = []
+    assert 0.05 < judge_run(tmp_path, tell=told.append, surface=False)["ate_rmse_cm"] < 0.2
+    assert told == []
+
+
+def test_a_path_behind_the_truth_is_told(tmp_path):
+    late_run(tmp_path, 1.0)
     told = []
     figures = judge_run(tmp_path, tell=told.append, surface=False)
     assert figures["ate_rmse_cm"] > 1

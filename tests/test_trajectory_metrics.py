@@ -233,7 +233,7 @@ def test_a_lag_is_found_and_what_the_error_were_without(late_s: float) -> None:
     assert found is not None
     assert found.seconds == pytest.approx(late_s, abs=1e-9)
     assert found.rmse_cm < 0.2
-    assert late_s == 0 or found.share < 0.05
+    assert late_s == 0 or found.rmse_cm < 0.05 * found.with_cm
 
 
 def test_a_lag_is_not_looked_for_in_a_moment() -> None:

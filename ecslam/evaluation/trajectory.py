@@ -123,11 +123,11 @@ def relative_error(estimate: Floats, truth: Floats, *, delta: int = 1) -> Relati
 
 @dataclass(frozen=True)
 class Lag:
-    """seconds: by how much an estimate is behind the truth. rmse_cm: its ATE without that, the ``share`` of it with."""
+    """seconds: by how much an estimate is behind the truth. rmse_cm: its ATE without that; with_cm: and with it."""
 
     seconds: float
     rmse_cm: float
-    share: float
+    with_cm: float
 
 
 def find_lag(estimate: Floats, truth: Floats, times: Floats) -> Lag | None:
@@ -144,8 +144,7 @@ def find_lag(estimate: Floats, truth: Floats, times: Floats) -> Lag | None:
     for i, lag in enumerate(lags):
         at = np.stack([np.interp(times[inner] + lag, known, axis) for axis in centres.T], 1)
         rmse[i] = np.sqrt(((align_umeyama(at, goal).apply(at) - goal) ** 2).sum(1).mean())
-    without = max(float(rmse[len(lags) // 2]), 1e-12)
-    return Lag(float(lags[rmse.argmin()]), float(100 * rmse.min()), float(rmse.min()) / without)
+    return Lag(float(lags[rmse.argmin()]), float(100 * rmse.min()), float(100 * rmse[len(lags) // 2]))
 
 
 def _finite(poses: Floats) -> NDArray[np.bool_]:

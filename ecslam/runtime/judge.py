@@ -18,7 +18,7 @@ from ..evaluation.trajectory_io import read_tum
 from ..types import InputError, Mesh
 
 SAME_S = 1e-6
-WORTH_SAYING = 0.8  # of the error, that a lag leaves
+LEFT, SAVED_CM = 0.8, 0.2  # a lag is worth saying where it leaves less of the error and saves more
 
 
 def judge_run(
@@ -46,7 +46,7 @@ def judge_run(
         raise InputError(f"{folder}: the sequence has no ground truth, so there is nothing to compare with")
     figures = _trajectory_figures(poses, truth)
     lag = find_lag(poses, truth, times)
-    if lag is not None and lag.share < WORTH_SAYING:
+    if lag is not None and lag.rmse_cm < min(LEFT * lag.with_cm, lag.with_cm - SAVED_CM):
         side = "behind" if lag.seconds > 0 else "ahead of"
         tell(
             f"the path is {1e3 * abs(lag.seconds):.0f} ms {side} the ground truth, and without that ate_rmse_cm would "
