@@ -194,13 +194,16 @@ def synth(
 
 @app.command()
 def check(sequence: SequenceArgument) -> None:
-    """Say what a recording is and what looks odd about it, before a run."""
+    """Say what a recording is and what looks odd about it, before a run. Fails where no frame can be read."""
     from .datasets import open_sequence
     from .datasets.check import check_sequence, format_report
 
     opened = open_sequence(sequence)
     config = resolve_config(None, opened, None, None, None, None)
-    typer.echo(format_report(check_sequence(opened, config=config)))
+    report = check_sequence(opened, config=config)
+    typer.echo(format_report(report))
+    if report.hopeless:
+        raise InputError(f"{sequence}: none of the {report.frames_read} frames tried can be read; the report says why")
 
 
 @bench.command(name="kernels")

@@ -127,6 +127,15 @@ def test_check_says_what_looks_odd(sequence, tmp_path):
     assert "depth000002.png" in report.out
 
 
+def test_check_fails_where_nothing_is_readable(sequence, tmp_path):
+    broken = shutil.copytree(sequence, tmp_path / "room")
+    for image in (broken / "results").glob("depth*.png"):
+        image.write_bytes(image.read_bytes()[:200])
+    report = ecslam("check", broken)
+    assert "0 of 8 tried readable" in report.out
+    assert_refused(report, str(broken), "none of the 8 frames")
+
+
 def test_a_name_that_the_output_cannot_encode_is_spelt_out(sequence, tmp_path):
     room = shutil.copytree(sequence, tmp_path / "кухня")
     out = io.TextIOWrapper(io.BytesIO(), "latin-1")

@@ -154,6 +154,22 @@ def test_it_lives_with_no_ground_truth_and_with_nothing_readable() -> None:
     text = format_report(report)
     assert "no ground truth" in text
     assert "0.png: broken" in text
+    assert text.count("broken") == 3
+    assert "and 37 more like these" in text
+    assert "nan" not in text
+    assert "none in what could be read" in text
+    assert "used " not in text
+
+
+def test_a_message_that_all_frames_share_is_said_once() -> None:
+    report = dataclasses.replace(check_sequence(Recording()), unreadable=("no depth here",) * 40)
+    assert format_report(report).count("no depth here") == 1
+
+
+def test_frames_without_any_depth_are_said_once() -> None:
+    report = check_sequence(Recording(depth=np.zeros((H, W), np.float32)))
+    assert report.odd == ("40 of 40 frames have no depth at all",)
+    assert "none in what could be read" in format_report(report)
 
 
 def test_a_path_that_does_not_open_is_an_input_error() -> None:

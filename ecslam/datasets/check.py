@@ -23,6 +23,7 @@ MOST_WITHOUT_DEPTH = 0.6
 MOST_LEFT_OUT = 0.5
 HARDLY_ANY = 0.05
 BLACK = 4.0  # mean colour value
+MOST_MESSAGES = 3
 JUMP_M, JUMP_DEG, JUMP_RATIO = 0.3, 30.0, 10.0
 
 
@@ -88,6 +89,11 @@ class CheckReport:
     time: TimeStats
     odd: tuple[str, ...]
 
+    @property
+    def hopeless(self) -> bool:
+        """Whether not one of the frames tried could be read."""
+        return len(self.unreadable) == self.frames_read
+
 
 def check_sequence(sequence: Sequence | str | Path, samples: int = 40, config: Config | None = None) -> CheckReport:
     """Look a sequence over for a run with ``config``, reading at most ``samples`` frames spread over it. Raises
@@ -124,7 +130,7 @@ def check_sequence(sequence: Sequence | str | Path, samples: int = 40, config: C
 
 def format_report(report: CheckReport) -> str:
     """The report as text for a terminal, one fact a line, oddities last."""
-    k, d, t, p = report.intrinsics, report.depth, report.time, report.poses
+    k, t, p = report.intrinsics, report.time, report.poses
     lens = ", distortion removed on reading" if k.distortion else ""
     rolling = f", depth read row by row in {1e3 * k.readout_s:.0f} ms" if k.readout_s else ""
     rows = [
@@ -134,14 +140,29 @@ def format_report(report: CheckReport) -> str:
             f"{report.frames}, {report.frames_read - len(report.unreadable)} of {report.frames_read} tried readable",
         ),
         ("images", f"{k.width}x{k.height}, fx {k.fx:.1f} fy {k.fy:.1f} cx {k.cx:.1f} cy {k.cy:.1f}{lens}"),
-        ("depth", f"{d.low_m:.2f} .. {d.high_m:.2f} m, median {d.median_m:.2f} m, {d.missing:.0%} of pixels without"),
-        ("used", f"{report.used_m[0]:.2f} .. {report.used_m[1]:.2f} m, {1 - d.too_near - d.too_far:.0%} of the depth"),
+        *_depth_lines(report.depth, report.used_m),
         ("time", f"{t.duration_s:.1f} s at {t.fps:.1f} frames/s{rolling}"),
         ("poses", "no ground truth" if p is None else _pose_line(p)),
-        *(("unreadable", message) for message in report.unreadable),
+        *(("unreadable", message) for message in _first_few(report.unreadable)),
         *(("odd", message) for message in report.odd or ("nothing",)),
     ]
     return "\n".join(f"{label:<12}{text}" for label, text in rows)
+
+
+def _depth_lines(d: DepthStats, used_m: tuple[float, float]) -> list[tuple[str, str]]:
+    if np.isnan(d.median_m):
+        return [("depth", "none in what could be read")]
+    return [
+        ("depth", f"{d.low_m:.2f} .. {d.high_m:.2f} m, median {d.median_m:.2f} m, {d.missing:.0%} of pixels without"),
+        ("used", f"{used_m[0]:.2f} .. {used_m[1]:.2f} m, {1 - d.too_near - d.too_far:.0%} of the depth"),
+    ]
+
+
+def _first_few(messages: tuple[str, ...]) -> list[str]:
+    """The first different ones, and how many there are besides."""
+    different = list(dict.fromkeys(messages))
+    more = len(different) - MOST_MESSAGES
+    return [*different[:MOST_MESSAGES], *([f"and {more} more like these"] if more > 0 else [])]
 
 
 def _pose_line(p: PoseStats) -> str:
@@ -230,7 +251,7 @@ def _odd_images(
         yield f"{black} of {tried} frames are black"
     if depth.empty:
         yield f"{depth.empty} of {tried} frames have no depth at all"
-    if depth.missing > MOST_WITHOUT_DEPTH and len(unreadable) < tried:
+    if depth.missing > MOST_WITHOUT_DEPTH and depth.empty < tried - len(unreadable):
         yield f"{depth.missing:.0%} of the pixels have no depth"
     if odd := _odd_distance(depth.median_m, depth.too_near, depth.too_far, used_m):
         yield odd
