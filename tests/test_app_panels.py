@@ -296,6 +296,16 @@ def test_notices_stay_on_the_page_until_a_restart(engine, page):
     assert until(lambda: not html.visible)
 
 
+def test_what_the_status_card_says_is_no_notice_besides(engine, page):
+    html = next(p for p in page.hub.panels if isinstance(p, Notices))._html
+    engine.skip_to(3)
+    engine._feed.publish(m.Notice("error", "the map exploded"))
+    assert until(lambda: "the map exploded" in html.content)
+    engine._feed.publish(replace(engine.latest(), state=m.State.FAILED, reason="the map exploded"))
+    assert until(lambda: not html.visible)
+    assert "the map exploded" not in html.content
+
+
 def test_a_finished_run_shows_its_notices(tmp_path):
     run = write_run(tmp_path / "a", 30)
     with (run / "events.jsonl").open("a") as log:

@@ -251,7 +251,9 @@ def test_restart_begins_again_beside_the_first_run(tmp_path):
         assert "is not on offer" in watch.ask(Restart(preset="none")).error
         assert "schedule must be one of" in watch.ask(Restart(schedule="fast")).error
         failed = watch.go(Restart(sequence="other"), State.FAILED)
-        assert "no such folder" in failed.reason
+        assert "the run before: other: no such folder" in failed.reason
+        assert (failed.sequence, failed.frame) == ("fake", 11)
+        assert watch.until(lambda m: isinstance(m, Notice) and m.level == "error").text == failed.reason
         watch.go(Restart(sequence="fake:12"), State.FINISHED)
         assert len(made) == 4
     first = json.loads((out / "summary.json").read_text())

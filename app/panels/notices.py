@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from ecslam.messages import Ack, Event, Notice, Restart
+from ecslam.messages import Ack, Event, Notice, Restart, Snapshot
 
 from .. import theme
 from ..hub import Hub
@@ -16,15 +16,22 @@ _COLORS = {"error": theme.BEFORE, "warning": theme.ESTIMATE}
 
 
 class Panel(BasePanel):
-    """The newest notices: a toast is gone after some seconds, and who opens the page later has not seen it."""
+    """The newest notices: a toast is gone after some seconds, and who opens the page later has not seen it. What the
+    status card says already is left out."""
 
     tab, order = "Run", 90
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
         noted = notices_in(hub.engine.run_folder)
-        self._newest, self._count = deque(noted, MOST), len(noted)
-        self._html = hub.server.gui.add_html(self._text(), visible=self._count > 0)
+        self._newest, self._count, self._said = deque(noted, MOST), len(noted), ""
+        self._html = hub.server.gui.add_html("", visible=False)
+        self._show()
+
+    def snapshot(self, s: Snapshot) -> None:
+        if s.reason != self._said:
+            self._said = s.reason
+            self._show()
 
     def event(self, event: Event) -> None:
         if isinstance(event, Notice) and event not in self._newest:
@@ -40,11 +47,18 @@ class Panel(BasePanel):
             self._show()
 
     def _show(self) -> None:
-        self._html.content, self._html.visible = self._text(), self._count > 0
+        self._html.content = text = self._text()
+        self._html.visible = bool(text)
 
     def _text(self) -> str:
-        notes = [theme.note(_words(n), _COLORS.get(n.level, theme.KEYFRAME)) for n in reversed(self._newest)]
+        notes = [
+            theme.note(_words(n), _COLORS.get(n.level, theme.KEYFRAME))
+            for n in reversed(self._newest)
+            if n.text != self._said
+        ]
         earlier = self._count - len(self._newest)
+        if not notes and not earlier:
+            return ""
         more = f'<span class="dim">and {earlier} before these, in events.jsonl</span>' if earlier else ""
         return theme.card(f"<b>Notices</b>{''.join(notes)}{more}")
 

@@ -183,8 +183,9 @@ class Engine:
         except (InputError, OSError) as error:
             self._control.begin(self._plan.config, self._plan.sequence.layout, 0)
             self._control.end()
-            self._failed(error)
-            self._show(State.FAILED, str(error))
+            told = f"not restarted, so what is shown is still the run before: {words(error)}"
+            self._failed(InputError(told))
+            self._show(State.FAILED, told)
             return Turn.STOP
         return self._one_run()
 
