@@ -241,6 +241,13 @@ def test_the_plots_of_a_replay_mark_the_frame_that_is_shown(replay_page):
     assert len(chart._plot.series) == 3
 
 
+def test_the_plots_number_frames_in_whole_steps(replay_page):
+    chart = next(p for p in replay_page.hub.panels if p.tab == "Plots")._error
+    steps = chart._plot.axes[0]["incrs"]
+    assert steps[:4] == (1, 2, 5, 10)
+    assert all(float(step).is_integer() for step in steps)
+
+
 def test_a_loop_is_inspected_only_while_it_has_happened(replay_page):
     choice, scene = control(replay_page, "Loop event")[1], replay_page.hub.scene
     with dial(replay_page) as client:

@@ -16,7 +16,9 @@ from ..hub import Hub
 from ..panel import BasePanel
 
 EVERY_S = 0.5
-HEIGHT, NEAR_PX = 150, 10
+HEIGHT, NEAR_PX = 158, 10
+X_AXIS_PX, Y_AXIS_PX = 36, 46
+_WHOLE = tuple(k * 10**n for n in range(7) for k in (1, 2, 5))
 _RESIDUAL = "_mm"  # ends the names of what is measured in millimetres and therefore no loss
 _PALETTE = (theme.ESTIMATE, theme.TRUTH, theme.WINDOW, theme.LOOP, (234, 179, 8), theme.BEFORE, theme.KEYFRAME)
 # Its class keeps it out of the legend and without a point under the mouse.
@@ -145,7 +147,9 @@ def _dots(name: str) -> uplot.Series:
 
 
 def _axes() -> tuple[uplot.Axis, ...]:
+    """Frames have whole numbers."""
     grid = uplot.Axis_Grid(stroke="rgba(128,128,128,0.18)", width=1)
     ticks = uplot.Axis_Ticks(stroke="rgba(128,128,128,0.3)", width=1)
     style = {"stroke": "rgb(128,134,146)", "grid": grid, "ticks": ticks, "font": "11px system-ui"}
-    return uplot.Axis(size=28, **style), uplot.Axis(size=46, **style)  # type: ignore[typeddict-item]
+    x, y = {"size": X_AXIS_PX, "incrs": _WHOLE, **style}, {"size": Y_AXIS_PX, **style}
+    return uplot.Axis(**x), uplot.Axis(**y)  # type: ignore[typeddict-item]
