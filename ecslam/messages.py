@@ -101,7 +101,8 @@ class KeyframeView:
 
 @dataclass(frozen=True)
 class FramePictures:
-    """The six pictures of one frame, all uint8 [h, w, 3]: colour and depth as input, rendered, and their difference."""
+    """The six pictures of one frame, all uint8 [h, w, 3]: colour and depth as input, rendered, and their difference.
+    took_s: seconds of the engine's time that they have cost."""
 
     frame: int
     color: NDArray[np.uint8]
@@ -110,6 +111,7 @@ class FramePictures:
     depth: NDArray[np.uint8]
     depth_rendered: NDArray[np.uint8]
     depth_difference: NDArray[np.uint8]
+    took_s: float = 0.0
 
 
 @dataclass(frozen=True)

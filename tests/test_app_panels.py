@@ -384,17 +384,21 @@ def test_an_export_that_fails_is_no_longer_under_way(page, engine, monkeypatch):
 def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, page):
     panel = next(p for p in page.hub.panels if p.tab == "Pictures")
     s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)
-    pictures = m.FramePictures(9, *[np.zeros((2, 2, 3), np.uint8)] * 6)
+    pictures = m.FramePictures(9, *[np.zeros((2, 2, 3), np.uint8)] * 6, took_s=0.3)
     with dial(page) as client:
         enter(client)
         assert until(lambda: list(page.hub.viewers()))
         panel.snapshot(replace(s, frame=10))
-        panel._asked -= 2.0
+        panel._asked -= 9.0
         panel.event(pictures)
-        assert 60 < panel._pause_s < 80
-        panel._asked -= 2.0
-        panel.event(pictures)
-        assert 60 < panel._pause_s < 80, "what somebody asked for says nothing about the time it takes"
+        for waited, asks in ((8.0, False), (11.0, True)):
+            panel._asked = time.monotonic() - waited
+            panel.snapshot(replace(s, frame=11))
+            assert (panel._asked_frame == 11) == asks
+        panel.event(replace(pictures, took_s=2.0))
+        panel._asked = time.monotonic() - 21.0
+        panel.snapshot(replace(s, frame=12))
+        assert panel._asked_frame == 12, "even pictures that wait for a compiler do not stop the refreshing"
 
 
 def test_a_page_opened_while_the_run_stands_still_shows_pictures(engine, page):

@@ -324,14 +324,24 @@ def test_pictures_of_the_newest_and_of_an_earlier_frame(tmp_path):
         watch.ask(RequestPictures())
         pictures = watch.event(FramePictures)
         assert pictures.frame == 8
-        shapes = {getattr(pictures, name).shape for name in vars(pictures) if name != "frame"}
+        shapes = {getattr(pictures, name).shape for name in vars(pictures) if name not in ("frame", "took_s")}
         assert shapes == {(48, 64, 3)}
+        assert 0 < pictures.took_s < 5
         assert (pictures.color == 8).all()
         assert (pictures.color_difference == 8).all()
         watch.ask(RequestPictures(5))
         assert watch.until(lambda m: isinstance(m, FramePictures) and m.frame == 5).color[0, 0, 0] == 5
         watch.ask(RequestPictures(20))
         assert "has not been processed" in watch.event(Notice).text
+
+
+def test_what_pictures_took_leaves_out_the_frame_that_they_wait_for(tmp_path):
+    behaviour = Behaviour()
+    with running(tmp_path, paused_at=3, behaviour=behaviour) as (_, watch, __):
+        behaviour.pause_s = 0.6
+        watch.ask(Step())
+        watch.ask(RequestPictures())
+        assert watch.event(FramePictures).took_s < 0.5
 
 
 def test_exports_are_files_that_other_programs_read(tmp_path):

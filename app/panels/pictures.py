@@ -14,7 +14,8 @@ from ecslam.messages import Event, FramePictures, KeyframeView, RequestPictures,
 from ..hub import Hub
 from ..panel import BasePanel
 
-EVERY_S, SHARE = 3.0, 0.03  # seconds between two requests at least; of the engine's time at most
+LEAST_S, MOST_S = 3.0, 20.0  # between two requests; the first pictures compile what renders them, and say little
+SHARE = 0.03  # of the engine's time
 _ORDER = (
     ("color", "colour"),
     ("depth", "depth"),
@@ -35,7 +36,7 @@ class Panel(BasePanel):
         gui = hub.server.gui
         self._html = gui.add_html(_message("No pictures yet." if hub.replay is None else "This run kept no pictures."))
         self._asked, self._asked_frame, self._keyframe = 0.0, -1, False
-        self._pause_s, self._waiting = EVERY_S, False
+        self._pause_s = LEAST_S
         if hub.replay is None:
             self._live = gui.add_checkbox("Refresh while running", True)
             hub.on(gui.add_button("Show current frame", color="gray"), self._show_current)
@@ -47,7 +48,7 @@ class Panel(BasePanel):
         due = time.monotonic() - self._asked > self._pause_s or s.state in (State.PAUSED, State.FINISHED)
         looked_at = self._live.value and not self._keyframe and bool(self.hub.server.get_clients())
         if looked_at and due and s.keyframes and s.frame != self._asked_frame:
-            self._asked, self._asked_frame, self._waiting = time.monotonic(), s.frame, True
+            self._asked, self._asked_frame = time.monotonic(), s.frame
             self.hub.submit(RequestPictures())
 
     def viewer(self) -> None:
@@ -57,8 +58,7 @@ class Panel(BasePanel):
 
     def event(self, event: Event) -> None:
         if isinstance(event, FramePictures):
-            if self._waiting:
-                self._pause_s, self._waiting = max(EVERY_S, (time.monotonic() - self._asked) / SHARE), False
+            self._pause_s = min(max(LEAST_S, event.took_s / SHARE), MOST_S)
             figures = "".join(_figure(getattr(event, field), name) for field, name in _ORDER)
             title = f"Keyframe {event.frame}" if self._keyframe else f"Frame {event.frame}"
             self._html.content = f'<div class="ec"><b>{title}</b><div class="ec-six">{figures}</div></div>'

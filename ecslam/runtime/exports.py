@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from time import monotonic
 
 from .. import config_files
 from ..evaluation.trajectory_io import format_kitti, format_tum
@@ -97,7 +99,9 @@ def render_pictures(run: Run, frame: int | None) -> FramePictures:
     wanted = run.tally.rows[-1] if frame is None else frame
     if wanted not in run.tally.rows:
         raise InputError(f"frame {wanted} has not been processed; there are 0 .. {run.tally.rows[-1]}")
+    began = monotonic()
     source = run.plan.sequence[wanted]
     color, depth = shrink(source.color, PICTURE_WIDTH), shrink_depth(source.depth, PICTURE_WIDTH)
     color_rendered, depth_rendered = run.slam.render(run.poses()[run.tally.rows.index(wanted)], depth)
-    return six_pictures(wanted, color, depth, color_rendered, depth_rendered)
+    pictures = six_pictures(wanted, color, depth, color_rendered, depth_rendered)
+    return replace(pictures, took_s=monotonic() - began)
