@@ -126,6 +126,7 @@ def test_a_distance_has_a_horizontal_and_a_vertical_part(swap):
     assert np.allclose(corner[:2], ends[1].point[:2], atol=1e-6), "plumb below the upper end"
     assert (corner - a) @ (b - corner) == pytest.approx(0)
     assert in_words(done) == "13.00 m\n↔ 5.00 m  ↕ 12.00 m"
+    assert "which way is up" not in table([done])
 
 
 def test_without_an_up_there_is_a_distance_only():
@@ -133,7 +134,8 @@ def test_without_an_up_there_is_a_distance_only():
     assert (done.distance, done.width, done.height) == (pytest.approx(0.5), None, None)
     assert done.legs() == []
     assert in_words(done) == "50.0 cm"
-    assert table([done]).count("–") == 2
+    assert table([done]).count("<td>–</td>") == 2
+    assert "which way is up" in table([done])
 
 
 def test_a_level_line_has_no_legs():

@@ -21,6 +21,7 @@ MOST = 5
 LINE_PX, RING_PX, LEG_PX = 4.0, 4.0, 2.0
 HOW = "Click two points on the mesh. Press Measure, or M, again to stop."
 FIRST, SECOND = "Measuring: click the first point on the mesh.", "Measuring: click the second point."
+NO_UP = "– where the map shows too little floor to tell which way is up."
 
 
 class _Measurer:
@@ -152,7 +153,8 @@ def table(done: Sequence[Measurement]) -> str:
         + "</tr>"
         for m in reversed(done)
     )
-    return theme.card(f"<table><tr><th>distance</th><th>horizontal</th><th>vertical</th></tr>{rows}</table>")
+    unknown = f'<span class="dim">{NO_UP}</span>' if any(m.up is None for m in done) else ""
+    return theme.card(f"<table><tr><th>distance</th><th>horizontal</th><th>vertical</th></tr>{rows}</table>{unknown}")
 
 
 def _lines(scene: viser.SceneApi, name: str, width: float) -> viser.LineSegmentsHandle:
