@@ -106,7 +106,7 @@ def _draw_errors(axes: Axes, error: AbsoluteError) -> None:
     axes.text(frames[-1], error.cm.rmse, "RMSE ", color=INK, size=9, ha="right", va="bottom")
     axes.set_xlim(0, max(1, len(frames) - 1))
     axes.set_ylim(0, 1.1 * error.cm.max + 1e-6)
-    axes.set_xlabel("frame", color=MUTED)
+    axes.set_xlabel("frame, without those skipped", color=MUTED)
     _style(axes, "Position error after alignment (cm)")
 
 
