@@ -167,7 +167,7 @@ class Hub:
     def deliver(self, client: viser.ClientHandle | None, path: Path) -> None:
         """Say where a file lies and start its download in the browser of who asked for it."""
         size = path.stat().st_size
-        text = f"{path}  ({size / 1e6:.1f} MB)"
+        text = f"{path}  ({theme.size(size)})"
         if client is None or client.client_id not in self.server.get_clients():
             return
         if size > DOWNLOAD_LIMIT:

@@ -125,3 +125,10 @@ def legend(entries: list[tuple[str, RGB]]) -> str:
 def number(value: float | None, digits: int = 2) -> str:
     """A figure for people; a dash where there is none."""
     return "–" if value is None or value != value else f"{value:.{digits}f}"
+
+
+def size(count: int) -> str:
+    """So many bytes for people: 820 bytes, 45 kB, 12.3 MB."""
+    if count < 1000:
+        return f"{count} bytes"
+    return f"{count / 1e3:.0f} kB" if count < 999_500 else f"{count / 1e6:.1f} MB"

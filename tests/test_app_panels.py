@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import viser
-from ecslam_app import server
+from ecslam_app import server, theme
 from ecslam_app.panel import TABS, BasePanel, find_panels
 from ecslam_app.panels.loops import Panel as Loops
 from ecslam_app.panels.notices import Panel as Notices
@@ -301,6 +301,22 @@ def test_notices_stay_on_the_page_until_a_restart(engine, page):
     assert "and 5 before these, in events.jsonl" in html.content
     engine.start().submit(m.Restart())
     assert until(lambda: not html.visible)
+
+
+def test_a_notice_names_its_frame_once(engine, page):
+    html = next(p for p in page.hub.panels if isinstance(p, Notices))._html
+    engine._feed.publish(m.Notice("info", "preset lite from frame 41 on", 41))
+    engine._feed.publish(m.Notice("warning", "lost, as in frame 41", 4))
+    assert until(lambda: "Frame 4: lost, as in frame 41" in html.content)
+    assert "Frame 41" not in html.content
+
+
+@pytest.mark.parametrize(
+    ("count", "says"),
+    [(820, "820 bytes"), (1_400, "1 kB"), (45_300, "45 kB"), (999_600, "1.0 MB"), (12_340_000, "12.3 MB")],
+)
+def test_files_have_sizes_for_people(count, says):
+    assert theme.size(count) == says
 
 
 def test_what_the_status_card_says_is_no_notice_besides(engine, page):

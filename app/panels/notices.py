@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 
 from ecslam.messages import Ack, Event, Notice, Restart, Snapshot
@@ -64,4 +65,6 @@ class Panel(BasePanel):
 
 
 def _words(notice: Notice) -> str:
-    return notice.text if notice.frame is None else f"Frame {notice.frame}: {notice.text}"
+    """The text, after the number of the frame that it is about where it does not name that itself."""
+    told = notice.frame is None or re.search(rf"\bframe {notice.frame}\b", notice.text)
+    return notice.text if told else f"Frame {notice.frame}: {notice.text}"
