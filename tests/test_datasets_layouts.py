@@ -526,13 +526,20 @@ def test_scannet_frames_may_lie_in_a_subfolder_and_skip_numbers(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["replica", "vmap"])
-def test_too_few_poses_are_refused_and_spare_ones_noted(tmp_path: Path, name: str) -> None:
+def test_missing_and_spare_poses_are_noted(tmp_path: Path, name: str) -> None:
     traj = next(WRITERS[name](tmp_path).rglob("traj*.txt"))
     rows = np.stack([pose(i).ravel() for i in range(N + 2)])
     save(traj, rows)
     assert any("2 poses without images" in p for p in problems(open_sequence(tmp_path)))
     save(traj, rows[: N - 1])
-    with pytest.raises(InputError, match="5 poses, but the images go up to frame 5"):
+    sequence = open_sequence(tmp_path)
+    poses = sequence.poses_gt()
+    assert poses is not None
+    assert np.isfinite(poses).all((1, 2)).tolist() == [True] * (N - 1) + [False]
+    assert any(p.startswith("1 of 6 ground-truth poses are missing") for p in problems(sequence))
+    assert not any("without images" in p for p in problems(sequence))
+    save(traj, rows[:, :15])
+    with pytest.raises(InputError, match="not a multiple of 16"):
         open_sequence(tmp_path)
 
 

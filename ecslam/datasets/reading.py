@@ -216,7 +216,7 @@ def read_pose_files(files: list[Path | None]) -> tuple[NDArray[np.float64] | Non
 def read_pose_list(path: Path, numbers: list[int]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
     """Poses [N, 4, 4] of frames ``numbers`` from a file with one 4x4 matrix a frame, and notes; None without the file.
 
-    Raises InputError when the file has fewer poses than the highest frame number asks for.
+    Frames after the file's last pose have NaN. Raises InputError for what holds no matrices.
     """
     if not path.is_file():
         return None, ()
@@ -224,10 +224,10 @@ def read_pose_list(path: Path, numbers: list[int]) -> tuple[NDArray[np.float64] 
     if values.size % 16:
         raise InputError(f"{path}: {values.size} numbers, not a multiple of 16; write one 4x4 matrix for each frame")
     poses = values.reshape(-1, 4, 4)
-    if len(poses) <= max(numbers):
-        raise InputError(
-            f"{path}: {len(poses)} poses, but the images go up to frame {max(numbers)}; add the missing poses"
-        )
-    spare = len(poses) - len(numbers)
-    found, notes = rigid(poses[list(numbers)])
+    wanted = np.array(numbers)
+    known = wanted < len(poses)
+    chosen = np.full((len(wanted), 4, 4), np.nan)
+    chosen[known] = poses[wanted[known]]
+    spare = len(poses) - int(known.sum())
+    found, notes = rigid(chosen)
     return found, (*notes, f"{path.name} has {spare} poses without images") if spare else notes
