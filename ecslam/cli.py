@@ -162,7 +162,10 @@ def view(
 
 @app.command(name="eval")
 def evaluate(folder: RunFolder) -> None:
-    """Compare a run with its sequence's ground truth: trajectory, Depth L1, Accuracy, Completion, Completion Ratio."""
+    """Compare a run with its sequence's ground truth: trajectory, Depth L1, Accuracy, Completion, Completion Ratio.
+
+    The surface takes some minutes: Depth L1 is the mean over 1,000 views.
+    """
     from . import commands
 
     commands.evaluate(folder)
@@ -274,7 +277,7 @@ def bench_accuracy(
     frames: Frames = "",
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each, with seeds 0, 1, ...")] = 3,
     ablate: Annotated[bool, typer.Option("--ablate", help="Also without FUS, without EBA, without both.")] = False,
-    no_surface: Annotated[bool, typer.Option("--no-surface", help="Trajectories only: saves a minute a run.")] = False,
+    no_surface: Annotated[bool, typer.Option("--no-surface", help="Trajectories only: saves minutes a run.")] = False,
     settings: Settings = None,
     device: Device = "auto",
     json: Json = None,

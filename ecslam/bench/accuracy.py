@@ -50,7 +50,7 @@ def bench_accuracy(
 ) -> Figures:
     """Run every preset with seeds 0, 1 ... ``seeds`` - 1, with ``ablate`` also without FUS, EBA and both.
 
-    surface: whether to compare meshes too, a minute for each run. settings: ``key=value``, laid over every preset.
+    surface: whether to compare meshes too, minutes for each run. settings: ``key=value``, laid over every preset.
     Returns plain values: under ``variants`` for each column a list of what ``measure`` gave, one for each seed. A run
     that fails is counted there by its ``error`` and never averaged away. Raises InputError for a preset, a setting or a
     sequence that cannot be used.

@@ -32,7 +32,7 @@ def judge_run(
 
     ate_*_cm, rpe_cm, rpe_deg and, where the sequence has a reference mesh, depth_l1_cm, accuracy_cm, completion_cm,
     completion_ratio (per cent). progress: gets the share done in 0..1. surface: False leaves out the latter, which
-    take a minute. tell: gets a sentence when some of them are missing, or cannot be written. Raises InputError without
+    take minutes. tell: gets a sentence when some of them are missing, or cannot be written. Raises InputError without
     a finished run or ground truth, and for a mesh that is damaged.
     """
     summary_path = folder / "summary.json"
