@@ -51,7 +51,7 @@ class Panel(BasePanel):
         straight = gui.add_button_group(
             "Look from",
             ("Above", "The side"),
-            hint="For you alone: a floor plan, or square to the walls; the grid's lines are half a metre apart",
+            hint="For you alone: a floor plan, whose grid has a line every half metre, or square to the walls",
         )
         hub.on(straight, lambda event: hub.views.straight(event.client, straight.value == "Above"))
 
