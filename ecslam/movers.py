@@ -86,7 +86,7 @@ def relief(depth: NDArray[np.float32]) -> Cells:
     inside = ((np.arange(SAMPLES) + 0.5) * cell / SAMPLES).astype(int)
     rows, columns = (side // cell * cell for side in depth.shape)
     looked_at = np.stack([depth[v:rows:cell, u:columns:cell] for v in inside for u in inside])
-    measured = looked_at > 0
+    measured = (looked_at > 0) & (looked_at < np.inf)
     nearest = np.where(measured, looked_at, np.float32(np.inf)).min(0)
     return np.where(2 * measured.sum(0) >= len(measured), nearest, np.float32(0))
 

@@ -51,6 +51,15 @@ def test_a_cell_has_the_nearest_depth_and_none_where_hardly_any_is_measured():
     assert np.count_nonzero(cells == 2) >= 48 * 64 - 2
 
 
+def test_depth_that_is_not_finite_is_none():
+    depth = np.full((480, 640), 2, np.float32)
+    depth[:240], depth[300:310, 400:410] = np.inf, np.nan
+    cells = relief(depth)
+    assert (cells[:24] == 0).all()
+    assert cells[30, 40] == 0
+    assert np.isfinite(cells).all()
+
+
 def test_a_nearer_pixel_that_is_looked_at_counts():
     depth = np.full((480, 640), 2, np.float32)
     depth[100:110, 200:205] = 1
