@@ -19,7 +19,7 @@ from .rigid import inverse
 from .types import Frame, Intrinsics
 
 COLUMNS, SAMPLES = 64, 4  # cells in a row of the image, and pixels of a cell's row or column that are looked at
-KEPT, EVERY = 17, 4  # keyframes that are remembered, and each which of them is asked
+KEPT, EVERY = 17, 2  # keyframes that are remembered, and each which of them is asked
 FRONT_M, FRONT_PER_M = 0.1, 0.03  # a point has come that is so much nearer than what was seen
 LEAST, MOST = 0.006, 0.7  # of all cells: fewer are noise, more are a wrong pose
 SLOPE = 0.03  # of the depth, between neighbouring cells of one surface
