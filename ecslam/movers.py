@@ -35,12 +35,12 @@ class Movers:
 
     def __init__(self, camera: Intrinsics) -> None:
         self._camera = camera
-        self._seen: list[Cells] = []
+        self._seen: list[NDArray[np.float32]] = []
         self._keyframes: list[int] = []
 
     def remember(self, frame: Frame, keyframe: int) -> None:
         """Keep what a frame saw that is the keyframe number ``keyframe``."""
-        self._seen = [*self._seen, relief(frame.depth)][-KEPT:]
+        self._seen = [*self._seen, around(relief(frame.depth))][-KEPT:]
         self._keyframes = [*self._keyframes, keyframe][-KEPT:]
 
     def without(self, frame: Frame, c2w: NDArray[np.float64], keyframe_poses: NDArray[np.float64]) -> Frame:
@@ -100,7 +100,8 @@ def compare(
 ) -> tuple[Mask, Mask]:
     """Which cells [h, w] lie in front of what one of the views saw there, and which where one of them saw a surface.
 
-    near: depth of the cells, from c2w [4, 4]. seen: the same [V, h, w] of earlier views, from ``poses`` [V, 4, 4].
+    near: depth of the cells, from c2w [4, 4]. seen: what is ``around`` those of earlier views [V, 2, h, w], which are
+    from ``poses`` [V, 4, 4].
     """
     fx, fy, cx, cy = lens
     rows, columns = near.shape
@@ -112,7 +113,9 @@ def compare(
         column, row = np.rint(x / z * fx + cx), np.rint(y / z * fy + cy)
     inside = (z > 0) & (near.reshape(-1) > 0) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     index = np.where(inside, row * columns + column, 0).astype(np.int64)
-    nearest, farthest = (np.take_along_axis(a.reshape(len(seen), -1), index, 1) for a in _around(seen))
+    nearest, farthest = (
+        np.take_along_axis(depth.reshape(len(seen), -1), index, 1) for depth in (seen[:, 0], seen[:, 1])
+    )
     inside &= nearest > 0
     margin = FRONT_M + FRONT_PER_M * nearest
     front = inside & (z < nearest - margin)
@@ -130,10 +133,10 @@ def large(mask: Mask) -> Mask:
 
 def grown(region: Mask, near: Cells, free: Mask) -> Mask:
     """A region [h, w] and what its surface goes on to, from neighbour to neighbour, over ``free`` cells with depth."""
-    around, left = np.ones((3, 3), np.uint8), free & (near > 0)
+    square, left = np.ones((3, 3), np.uint8), free & (near > 0)
     while region.any():
-        farthest = cv2.dilate(np.where(region, near, np.float32(-np.inf)), around)
-        nearest = cv2.erode(np.where(region, near, np.float32(np.inf)), around)
+        farthest = cv2.dilate(np.where(region, near, np.float32(-np.inf)), square)
+        nearest = cv2.erode(np.where(region, near, np.float32(np.inf)), square)
         left &= ~region
         more = left & (near < farthest + SLOPE * near) & (near > nearest - SLOPE * near)
         if not more.any():
@@ -142,9 +145,9 @@ def grown(region: Mask, near: Cells, free: Mask) -> Mask:
     return region
 
 
-def _around(seen: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The nearest and the farthest depth in and around each cell [V, h, w]; 0 where there is none in it."""
-    around, known = np.ones((3, 3), np.uint8), seen > 0
-    nearest = np.stack([cv2.erode(view, around) for view in np.where(known, seen, np.float32(np.inf))])
-    farthest = np.stack([cv2.dilate(view, around) for view in seen])
-    return np.where(known, nearest, np.float32(0)), np.asarray(farthest, np.float32)
+def around(seen: Cells) -> NDArray[np.float32]:
+    """The nearest and the farthest depth in and around each cell [2, h, w] of a view [h, w]; 0 where there is none in
+    it."""
+    square, known = np.ones((3, 3), np.uint8), seen > 0
+    nearest = cv2.erode(np.where(known, seen, np.float32(np.inf)), square)
+    return np.stack([np.where(known, nearest, np.float32(0)), cv2.dilate(seen, square)]).astype(np.float32)

@@ -8,7 +8,7 @@ import pytest
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.evaluation.trajectory import absolute_error
-from ecslam.movers import EVERY, KEPT, MOVING, Movers, cell_px, compare, grown, large, relief
+from ecslam.movers import EVERY, KEPT, MOVING, Movers, around, cell_px, compare, grown, large, relief
 from ecslam.slam import Slam
 from ecslam.types import Frame
 
@@ -70,7 +70,7 @@ def test_a_nearer_pixel_that_is_looked_at_counts():
     ("near_m", "came", "settled"), [(2.0, True, False), (2.85, False, True), (3.1, False, True), (4.0, False, False)]
 )
 def test_what_is_in_front_has_come_and_what_is_where_a_surface_was_is_settled(near_m, came, settled):
-    found = compare(np.full_like(WALL, near_m), LENS, HERE, WALL[None], HERE[None])
+    found = compare(np.full_like(WALL, near_m), LENS, HERE, around(WALL)[None], HERE[None])
     assert [mask.any() for mask in found] == [came, settled]
     assert [mask.all() for mask in found] == [came, settled]
 
@@ -80,7 +80,7 @@ def test_a_view_from_elsewhere_is_asked_where_it_saw_the_point():
     aside[0, 3] = 0.6  # ten columns at three metres
     seen = np.array(WALL)
     seen[:, :20] = 0
-    came, settled = compare(WALL, LENS, HERE, seen[None], aside[None])
+    came, settled = compare(WALL, LENS, HERE, around(seen)[None], aside[None])
     assert not came.any()
     assert not settled[:, :30].any()
     assert settled[:, 30:].all()
@@ -89,12 +89,12 @@ def test_a_view_from_elsewhere_is_asked_where_it_saw_the_point():
 def test_an_edge_that_moves_by_a_cell_has_not_come():
     pole, moved = np.array(WALL), np.array(WALL)
     pole[:, 30:33], moved[:, 31:34] = 1, 1
-    assert not compare(moved, LENS, HERE, pole[None], HERE[None])[0].any()
+    assert not compare(moved, LENS, HERE, around(pole)[None], HERE[None])[0].any()
 
 
 def test_nothing_is_known_where_nothing_was_measured():
     for near, seen in ((WALL, np.zeros_like(WALL)), (np.zeros_like(WALL), WALL)):
-        assert not any(mask.any() for mask in compare(near, LENS, HERE, seen[None], HERE[None]))
+        assert not any(mask.any() for mask in compare(near, LENS, HERE, around(seen)[None], HERE[None]))
 
 
 def test_small_regions_are_noise():
