@@ -284,8 +284,8 @@ def bench_accuracy(
 ) -> None:
     """Trajectory and surface against the ground truth, mean and deviation over seeds; the paper's ablation."""
     from . import commands
-    from .bench.accuracy import bench_accuracy, errors, print_table
-    from .bench.runs import require_a_run
+    from .bench.accuracy import bench_accuracy, print_table
+    from .bench.runs import errors, require_a_run
 
     names = [name.strip() for name in presets.split(",")]
     result = bench_accuracy(
@@ -300,7 +300,7 @@ def bench_accuracy(
     )
     print_table(result)
     commands.write_json(json, result)
-    require_a_run(list(errors(result).values()), seeds)
+    require_a_run(list(errors(result["variants"]).values()), seeds)
 
 
 def resolve_config(

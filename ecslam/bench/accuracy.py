@@ -15,7 +15,7 @@ from ..datasets import open_sequence, select_frames
 from ..runtime.engine import Engine
 from ..runtime.judge import judge_run
 from ..types import InputError
-from .runs import Figures, in_own_process, on_frames, preset_config, print_failures, progress, say
+from .runs import Figures, errors, in_own_process, on_frames, preset_config, print_failures, progress, say
 
 ABLATED: dict[str, tuple[str, ...]] = {
     "": (),
@@ -100,17 +100,12 @@ def print_table(result: Figures, console: Console | None = None) -> None:
         cells = [_cell([run.get(key) for run in runs]) for runs in result["variants"].values()]
         if any(cells):
             table.add_row(label, *cells)
-    failed = errors(result)
+    failed = errors(result["variants"])
     if any(failed.values()):
         table.add_row("failed runs", *(str(len(found)) for found in failed.values()))
     if any(len(found) < result["seeds"] for found in failed.values()):
         console.print(table)
     print_failures(console, failed, result["seeds"])
-
-
-def errors(result: Figures) -> dict[str, list[str]]:
-    """What ended the runs of each variant that failed."""
-    return {name: [run["error"] for run in runs if "error" in run] for name, runs in result["variants"].items()}
 
 
 def _cell(values: list[float | None]) -> str:

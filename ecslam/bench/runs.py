@@ -59,6 +59,11 @@ def on_frames(sequence: str, frames: str) -> str:
     return f"{sequence} {frames}".rstrip()
 
 
+def errors(runs: dict[str, list[Figures]]) -> dict[str, list[str]]:
+    """What ended the runs of each name that failed."""
+    return {name: [run["error"] for run in found if "error" in run] for name, found in runs.items()}
+
+
 def print_failures(console: Console, errors: dict[str, list[str]], runs: int) -> None:
     """A line for each name of whose ``runs`` some failed."""
     for name, found in errors.items():

@@ -22,7 +22,7 @@ from ..runtime.checkpoint import load_checkpoint
 from ..runtime.engine import Engine
 from ..runtime.memory import resident_mb
 from .peer import measure_open3d, open3d_missing
-from .runs import in_own_process, on_frames, preset_config, print_failures, progress, say
+from .runs import errors, in_own_process, on_frames, preset_config, print_failures, progress, say
 
 SPAN = 200
 SMOOTH = 25
@@ -82,7 +82,7 @@ def bench_speed(
         "threads": torch.get_num_threads(),
         "repeats": repeats,
         "presets": medians,
-        "errors": {name: [run["error"] for run in found if "error" in run] for name, found in runs.items()},
+        "errors": errors(runs),
         "peer": rival,
         "peer_note": note,
         "ratio": {name: m["fps_wall"] / rival["fps_wall"] for name, m in medians.items()} if rival else {},
