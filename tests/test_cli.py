@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 import torch
 
-from ecslam import cli, commands
+from ecslam import cli, commands, reports
 from ecslam.bench import accuracy, speed
-from ecslam.commands import draw_picture
 from ecslam.config_files import apply_settings, load_config, load_preset
 from ecslam.datasets.meshes import load_mesh
+from ecslam.reports import draw_picture
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.types import InputError, Mesh
 
@@ -273,7 +273,7 @@ def test_a_full_disk_at_the_picture_is_a_warning(finished, tmp_path, capsys, mon
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    commands.finish_run(folder, summary(folder))
+    reports.finish_run(folder, summary(folder))
     said = capsys.readouterr().out
     assert "warning: picture.png was not made: [Errno 28] No space left on device" in said
     assert str(folder / "summary.json") in said

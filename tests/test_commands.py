@@ -13,36 +13,36 @@ from ecslam_app import server
 from fake_slam import Behaviour, FakeSequence
 from runtime_watch import running
 
-from ecslam import commands
+from ecslam import commands, reports
 from ecslam.messages import Quit, Restart, Resume, State
 from ecslam.types import InputError
 
 
 def test_every_run_is_reported_once_as_soon_as_it_is_over(tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr(commands, "finish_run", lambda folder, summary: told.append((folder, summary["frames"])))
+    monkeypatch.setattr(reports, "finish_run", lambda folder, summary: told.append((folder, summary["frames"])))
     with running(tmp_path / "r", FakeSequence(4)) as (engine, watch, _):
-        reports = commands.Reports(engine)
-        reports.watch(watch.state(State.FINISHED))
-        reports.watch(engine.latest())
-        reports.watch(watch.go(Restart(), State.FINISHED))
-        reports.close()
+        told_of = reports.Reports(engine)
+        told_of.watch(watch.state(State.FINISHED))
+        told_of.watch(engine.latest())
+        told_of.watch(watch.go(Restart(), State.FINISHED))
+        told_of.close()
     assert told == [(tmp_path / "r", 4), (tmp_path / "r-2", 4)]
 
 
 def test_what_ended_a_run_is_said_in_the_terminal_too(tmp_path, capsys):
     with running(tmp_path / "r", FakeSequence(4), Behaviour(fail_at=2)) as (engine, watch, _):
-        reports = commands.Reports(engine)
-        reports.watch(watch.state(State.FAILED))
+        told_of = reports.Reports(engine)
+        told_of.watch(watch.state(State.FAILED))
         assert "error: the map exploded" in capsys.readouterr().out
-        reports.close()
+        told_of.close()
 
 
 def test_a_run_that_was_left_early_says_how_to_get_its_mesh(tmp_path, capsys):
     with running(tmp_path / "r", paused_at=3) as (engine, _, __):
         engine.submit(Quit())
         assert engine.join(10)
-        commands.finish_run(engine.run_folder, engine.summary)
+        reports.finish_run(engine.run_folder, engine.summary)
     said = " ".join(capsys.readouterr().out.split())
     assert f"ecslam mesh {tmp_path / 'r'} makes it" in said
     assert f"ecslam resume {tmp_path / 'r'} goes on" in said
@@ -52,7 +52,7 @@ def test_a_run_that_was_left_before_its_first_checkpoint_is_to_be_started_again(
     with running(tmp_path / "r", paused_at=0) as (engine, _, __):
         engine.submit(Quit())
         assert engine.join(10)
-        commands.finish_run(engine.run_folder, engine.summary)
+        reports.finish_run(engine.run_folder, engine.summary)
     said = capsys.readouterr().out
     assert "nothing to go on from: start again with ecslam run" in said
     assert not any(command in said for command in ("ecslam mesh", "ecslam resume"))
@@ -69,7 +69,7 @@ def test_results_lost_to_a_full_disk_are_an_error(tmp_path, monkeypatch, capsys)
         monkeypatch.setattr(os, "fsync", full)
         watch.go(Resume(), State.FINISHED)
         with pytest.raises(InputError) as lost:
-            commands.finish_run(engine.run_folder, engine.summary)
+            reports.finish_run(engine.run_folder, engine.summary)
     assert str(lost.value) == (
         f"{tmp_path / 'r'}: trajectory.txt, checkpoints, mesh.ply, summary.json could not be saved "
         f"(No space left on device); make room, then: ecslam resume {tmp_path / 'r'}"

@@ -53,6 +53,7 @@ LAYERS = (
     ("slam",),
     ("runtime",),
     ("bench",),
+    ("reports",),
     ("commands",),
     ("cli",),
 )
