@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .se3 import retract, rotation_angle_deg
+from .se3 import retract
 from .tracker import TrackResult
 
 LOST_FIT = 0.25
@@ -97,7 +97,8 @@ class Recovery:
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], metres: float, degrees: float) -> bool:
     """Whether two poses [4, 4] are less than this apart."""
-    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])) < metres and float(rotation_angle_deg(a, b)) < degrees
+    cosine = 0.5 * (np.vdot(a[:3, :3], b[:3, :3]) - 1)
+    return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < metres and cosine > np.cos(np.radians(degrees)))
 
 
 def around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:

@@ -60,15 +60,14 @@ def to_json(value: Any) -> str:
         return _dumps(_without_nan(value))
 
 
-def _dumps(value: Any) -> str:
-    return json.dumps(value, separators=(",", ":"), allow_nan=False, default=_listed)
-
-
 def _listed(value: Any) -> Any:
     """A numpy number or array as a plain one. Raises TypeError for anything else."""
     if not hasattr(value, "tolist"):
         raise TypeError(f"{type(value).__name__} cannot be written as JSON")
     return value.tolist()
+
+
+_dumps = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_listed).encode
 
 
 def _without_nan(value: Any) -> Any:
