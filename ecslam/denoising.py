@@ -26,8 +26,8 @@ def denoised(frame: Frame, config: Config) -> Frame:
     if config.denoise == (frame.measured is not None):
         return frame
     if frame.measured is not None:
-        return replace(frame, depth=frame.measured, measured=None)
-    return replace(frame, depth=smoothed(frame.depth), measured=frame.depth)
+        return replace(frame, depth=frame.measured, relief=None, measured=None)
+    return replace(frame, depth=smoothed(frame.depth), relief=None, measured=frame.depth)
 
 
 def smoothed(depth: NDArray[np.float32]) -> NDArray[np.float32]:

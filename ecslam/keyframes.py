@@ -3,6 +3,7 @@ what it is known again by."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -135,12 +136,11 @@ def make_thumbnail(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     return flat / np.float32(max(float(np.linalg.norm(flat)), 1e-6))
 
 
-def surface_points(keyframes: list[Keyframe], poses: NDArray[np.float64], limit: int) -> NDArray[np.float32]:
+def surface_points(keyframes: Sequence[Keyframe], poses: NDArray[np.float64], limit: int) -> NDArray[np.float32]:
     """Measured points [N, 3] of keyframes in the world, given their poses [K, 4, 4]: about ``limit`` of them where
     there are more."""
     stride = max(1, -(-sum(map(len, keyframes)) // limit))
-    thinned = [k.pixels.take(np.arange(0, len(k), stride)) for k in keyframes]
-    parts = [pixels.in_world(pose) for pixels, pose in zip(thinned, poses, strict=True)]
+    parts = [keyframe.pixels.every(stride).in_world(pose) for keyframe, pose in zip(keyframes, poses, strict=True)]
     return np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
 
 

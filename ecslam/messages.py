@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from .types import Mesh
 
+MOVING = "something moves in the picture and is left out"
+
 
 class State(str, Enum):
     """What the engine is doing, in plain words."""

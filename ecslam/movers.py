@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .kernels import earlier_views
 from .rigid import inverse
 from .types import Frame, Intrinsics
 
@@ -23,8 +24,6 @@ KEPT, EVERY = 17, 2  # keyframes that are remembered, and each which of them is 
 FRONT_M, FRONT_PER_M = 0.1, 0.03  # a point has come that is so much nearer than what was seen
 LEAST, MOST = 0.006, 0.7  # of all cells: fewer are noise, more are a wrong pose
 SLOPE = 0.03  # of the depth, between neighbouring cells of one surface
-
-MOVING = "something moves in the picture and is left out"
 
 Cells = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -37,28 +36,35 @@ class Movers:
         self._camera = camera
         self._seen: list[NDArray[np.float32]] = []
         self._keyframes: list[int] = []
+        self._ask()
+
+    def _ask(self) -> None:
+        """Work out which of what is remembered is asked from now on."""
+        asked = range(len(self._seen))[::-EVERY]
+        self._asked = np.array([self._seen[i] for i in asked]), [self._keyframes[i] for i in asked]
 
     def remember(self, frame: Frame, keyframe: int) -> None:
         """Keep what a frame saw that is the keyframe number ``keyframe``."""
-        self._seen = [*self._seen, around(relief(frame.depth))][-KEPT:]
+        self._seen = [*self._seen, around(_relief_of(frame))][-KEPT:]
         self._keyframes = [*self._keyframes, keyframe][-KEPT:]
+        self._ask()
 
     def without(self, frame: Frame, c2w: NDArray[np.float64], keyframe_poses: NDArray[np.float64]) -> Frame:
         """The frame, seen from about c2w [4, 4], with no depth where something has come; itself where nothing has.
         keyframe_poses: [K, 4, 4] of all keyframes."""
-        asked = range(len(self._seen))[::-EVERY]
-        if not asked:
+        seen, keyframes = self._asked
+        if not keyframes:
             return frame
-        near, cell = relief(frame.depth), cell_px(frame.depth)
-        seen, poses = np.stack([self._seen[i] for i in asked]), keyframe_poses[[self._keyframes[i] for i in asked]]
-        came, settled = compare(near, cell_lens(self._camera, cell), c2w, seen, poses)
+        near, cell = _relief_of(frame), cell_px(frame.depth)
+        came, settled = compare(near, cell_lens(self._camera, cell), c2w, seen, keyframe_poses[keyframes])
         region = grown(large(came), near, ~settled)
         if not region.any() or region.mean() > MOST:
             return frame
         hidden = cv2.dilate(region.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
         sides = zip(frame.depth.shape, near.shape, strict=True)
         rows, columns = (np.minimum(np.arange(pixels) // cell, cells - 1) for pixels, cells in sides)
-        return replace(frame, depth=np.where(hidden[rows][:, columns], np.float32(0), frame.depth), keyframe=None)
+        left = np.where(hidden[rows][:, columns], np.float32(0), frame.depth)
+        return replace(frame, depth=left, relief=None, keyframe=None)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """What ``load`` needs."""
@@ -67,6 +73,11 @@ class Movers:
     def load(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from what ``state`` gave."""
         self._seen, self._keyframes = list(state["seen"]), state["keyframes"].tolist()
+        self._ask()
+
+
+def _relief_of(frame: Frame) -> Cells:
+    return relief(frame.depth) if frame.relief is None else frame.relief
 
 
 def cell_px(depth: NDArray[np.float32]) -> int:
@@ -83,12 +94,10 @@ def cell_lens(camera: Intrinsics, cell: int) -> tuple[float, float, float, float
 def relief(depth: NDArray[np.float32]) -> Cells:
     """The nearest depth in each cell [h, w] of an image, 0 where less than half of the cell is measured."""
     cell = cell_px(depth)
-    inside = ((np.arange(SAMPLES) + 0.5) * cell / SAMPLES).astype(int)
-    rows, columns = (side // cell * cell for side in depth.shape)
-    looked_at = np.stack([depth[v:rows:cell, u:columns:cell] for v in inside for u in inside])
-    measured = (looked_at > 0) & (looked_at < np.inf)
-    nearest = np.where(measured, looked_at, np.float32(np.inf)).min(0)
-    return np.where(2 * measured.sum(0) >= len(measured), nearest, np.float32(0))
+    inside = ((np.arange(SAMPLES) + 0.5) * cell / SAMPLES).astype(np.int64)
+    out = np.empty([side // cell for side in depth.shape], np.float32)
+    earlier_views.nearest(np.ascontiguousarray(depth, np.float32), cell, inside, out)
+    return out
 
 
 def compare(
@@ -103,30 +112,20 @@ def compare(
     near: depth of the cells, from c2w [4, 4]. seen: what is ``around`` those of earlier views [V, 2, h, w], which are
     from ``poses`` [V, 4, 4].
     """
-    fx, fy, cx, cy = lens
-    rows, columns = near.shape
-    v, u = np.indices(near.shape, np.float32)
-    local = np.stack([(u - cx) / fx * near, (v - cy) / fy * near, near]).reshape(3, -1).astype(np.float32)
-    to_view = (inverse(poses) @ c2w).astype(np.float32)
-    x, y, z = (to_view[:, :3, :3] @ local + to_view[:, :3, 3:]).transpose(1, 0, 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column, row = np.rint(x / z * fx + cx), np.rint(y / z * fy + cy)
-    inside = (z > 0) & (near.reshape(-1) > 0) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    index = np.where(inside, row * columns + column, 0).astype(np.int64)
-    nearest, farthest = (
-        np.take_along_axis(depth.reshape(len(seen), -1), index, 1) for depth in (seen[:, 0], seen[:, 1])
-    )
-    inside &= nearest > 0
-    margin = FRONT_M + FRONT_PER_M * nearest
-    front = inside & (z < nearest - margin)
-    surface = inside & ~front & (z < farthest + margin)
-    return front.any(0).reshape(near.shape), surface.any(0).reshape(near.shape)
+    came, settled = np.zeros((2, *near.shape), np.bool_)
+    to_view = (inverse(poses) @ c2w)[:, :3].astype(np.float32)
+    front = np.array([FRONT_M, FRONT_PER_M], np.float32)
+    earlier_views.compare(near, np.array(lens, np.float32), to_view, seen, front, came, settled)
+    return came, settled
 
 
 def large(mask: Mask) -> Mask:
     """The connected regions of a mask [h, w] that have at least ``LEAST`` of its cells."""
+    least = LEAST * mask.size
+    if np.count_nonzero(mask) < least:
+        return np.zeros_like(mask)
     _, labels, found, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    enough = found[:, cv2.CC_STAT_AREA] >= LEAST * mask.size
+    enough = found[:, cv2.CC_STAT_AREA] >= least
     enough[0] = False
     return np.asarray(enough[labels])
 

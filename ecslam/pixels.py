@@ -38,17 +38,24 @@ class Pixels:
         """Measured surface points [M, 3] in camera coordinates, of the pixels with depth."""
         index = np.flatnonzero(self.depth > 0)  # three times as quick as a mask
         out = np.empty((len(index), 3), np.float32)
-        out[:, 2] = self.depth.take(index)
-        np.multiply(self.direction.take(index, 0), out[:, 2:], out[:, :2])
+        z, (x, y) = self.depth.take(index), self.direction.take(index, 0).T
+        for part, values in zip(out.T, (x * z, y * z, z), strict=True):  # numpy is slow along rows of three
+            part[:] = values
         return out
 
     def in_world(self, c2w: NDArray[np.float64]) -> NDArray[np.float32]:
         """``points`` [M, 3] in the world, seen from c2w [4, 4]."""
-        return (self.points() @ c2w[:3, :3].T + c2w[:3, 3]).astype(np.float32)
+        return (c2w[:3, :3].astype(np.float32) @ self.points().T + c2w[:3, 3:].astype(np.float32)).T
 
     def take(self, index: NDArray[np.integer]) -> Pixels:
         """The pixels at ``index``."""
-        return Pixels(self.direction[index], self.depth[index], self.color[index], self.feature[index])
+        color, feature = self.color.take(index, 0), self.feature.take(index)
+        return Pixels(self.direction.take(index, 0), self.depth.take(index), color, feature)
+
+    def every(self, stride: int) -> Pixels:
+        """Every ``stride``-th pixel."""
+        some = slice(None, None, stride)
+        return Pixels(self.direction[some], self.depth[some], self.color[some], self.feature[some])
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,8 @@ class SceneBox:
         A box from the configuration stays, and the note says how many lie outside, again when they have doubled."""
         points = pixels.take(evenly(len(pixels), POINTS)).in_world(c2w)
         low, high = box
-        outside = ((points < low) | (points > high)).any(1).mean() if len(points) else 0.0
+        x, y, z = ((points < low) | (points > high)).T
+        outside = np.mean(x | y | z) if len(points) else 0.0
         if self._config.box is None:
             return self._around(points) if outside > OUTSIDE_SHARE else None, ""
         if outside <= max(OUTSIDE_SHARE, 2 * self._told):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,8 +28,7 @@ from .kernels.graphs import Recorder
 from .keyframes import Keyframe, Shelf, make_keyframe, surface_points
 from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
-from .messages import LoopEvent, StepReport
-from .movers import MOVING
+from .messages import MOVING, LoopEvent, StepReport
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .scene_box import SceneBox
 from .shutter import STILL
@@ -299,10 +299,10 @@ class Slam:
 
     # ---- views and settings ------------------------------------------------------------------------------------------
 
-    def surface_points(self, limit: int) -> NDArray[np.float32]:
-        """Measured points [N, 3] of all keyframes in the world, where the map has been observed: about ``limit`` of
-        them where there are more."""
-        return surface_points(self.keyframes, self.trajectory.keyframe_poses(), limit)
+    def surface_points(self, limit: int) -> Callable[[], NDArray[np.float32]]:
+        """Measured points [N, 3] of all keyframes in the world, where the map has been observed by now: about ``limit``
+        of them where there are more. Any thread may work them out, whenever it calls what is returned."""
+        return partial(surface_points, tuple(self.keyframes), self.trajectory.keyframe_poses(), limit)
 
     @property
     def field(self) -> TsdfField | None:

@@ -8,7 +8,8 @@ import pytest
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.evaluation.trajectory import absolute_error
-from ecslam.movers import EVERY, KEPT, MOVING, Movers, around, cell_px, compare, grown, large, relief
+from ecslam.messages import MOVING
+from ecslam.movers import EVERY, KEPT, Movers, around, cell_px, compare, grown, large, relief
 from ecslam.slam import Slam
 from ecslam.types import Frame
 

@@ -108,7 +108,7 @@ def test_a_mapping_whose_keyframe_was_missed_begins_with_the_next():
 
 def off_surface(engine):
     """Median distance (metres) that the map gives at measured surface points."""
-    points = engine.surface_points(5000)
+    points = engine.surface_points(5000)()
     return float(np.median(np.abs(engine.query()[0](points))) * engine.config.truncation_m)
 
 

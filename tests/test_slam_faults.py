@@ -131,7 +131,7 @@ def test_the_box_grows_when_the_camera_leaves_it():
     assert (grown[0] <= first[0]).all()
     assert (grown[1] >= first[1]).all()
     assert np.prod(grown[1] - grown[0]) > 1.1 * np.prod(first[1] - first[0])
-    points = slam.surface_points(100_000)
+    points = slam.surface_points(100_000)()
     assert ((points >= grown[0]) & (points <= grown[1])).all(1).mean() > 0.98
     assert error_cm(slam, 60) < 5
 
@@ -147,7 +147,7 @@ def test_a_map_that_began_small_stays_within_its_table():
     assert all(r.tracked for r in reports)
     assert error_cm(slam, 15) < 3
     sdf, _ = slam.query()
-    assert np.median(np.abs(sdf(slam.surface_points(5000)))) < 0.3
+    assert np.median(np.abs(sdf(slam.surface_points(5000)()))) < 0.3
 
 
 @pytest.mark.slow
@@ -240,5 +240,5 @@ def test_depth_that_is_not_finite_or_out_of_range_is_none():
     assert all(r.tracked for r in reports)
     assert error_cm(slam, 6) < 3
     assert all(np.isfinite(value).all() for value in slam.state().values() if value.dtype.kind == "f")
-    points = slam.surface_points(100_000)
+    points = slam.surface_points(100_000)()
     assert (np.linalg.norm(points - slam.trajectory[-1][:3, 3], axis=1) < 9).all()

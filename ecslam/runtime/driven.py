@@ -68,8 +68,8 @@ class SlamLike(Protocol):
         """The last mapping; ``interrupt`` as in ``step``."""
         ...
 
-    def surface_points(self, limit: int) -> NDArray[np.float32]:
-        """At most about ``limit`` measured points [N, 3] in the world."""
+    def surface_points(self, limit: int) -> Callable[[], NDArray[np.float32]]:
+        """At most about ``limit`` measured points [N, 3] in the world as it is now, for any thread to work out."""
         ...
 
     def query(self) -> tuple[Callable[[NDArray[np.float32]], Any], Callable[[NDArray[np.float32]], NDArray[np.uint8]]]:

@@ -26,7 +26,7 @@ BLOCK_M = 0.08
 
 @dataclass(frozen=True)
 class FrozenMap:
-    """A map that nobody writes to, from ``frame``. points: float32 [N, 3], measured surface, metres.
+    """A map that nobody writes to, from ``frame``. points: works out float32 [N, 3], measured surface, metres.
 
     sdf, color: numpy callables as ``Slam.query`` gives them.
     """
@@ -34,7 +34,7 @@ class FrozenMap:
     frame: int
     sdf: Callable[[NDArray[np.float32]], NDArray[np.floating]]
     color: Callable[[NDArray[np.float32]], NDArray[np.uint8]]
-    points: NDArray[np.float32]
+    points: Callable[[], NDArray[np.float32]]
 
 
 def build_mesh(
@@ -48,7 +48,7 @@ def build_mesh(
     When it has more than ``max_triangles`` (0 = no limit) it is made again with a voxel that keeps to them.
     Raises MeshingStopped.
     """
-    observed = ObservedBlocks.from_points(frozen.points, max(BLOCK_M, voxel_m))
+    observed = ObservedBlocks.from_points(frozen.points(), max(BLOCK_M, voxel_m))
     while True:
         mesh = extract_mesh(frozen.sdf, frozen.color, observed, voxel_m, should_stop=should_stop)
         if not max_triangles or len(mesh.faces) <= max_triangles:

@@ -17,8 +17,7 @@ from ..datasets.check import lacking_depth, odd_depth
 from ..datasets.views import in_order, problems
 from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
-from ..messages import Event, LoopEvent, Notice, StepReport
-from ..movers import MOVING
+from ..messages import MOVING, Event, LoopEvent, Notice, StepReport
 from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint

@@ -1,0 +1,72 @@
+"""The loops that hold a frame's depth against what earlier views saw (numba), in cells of a few pixels. What is
+worked out for every cell is laid out so that several of a row go at once: without branches, and in plain float32."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def nearest(depth, cell, inside, out):
+    """The nearest depth in each cell, 0 where less than half of it is measured.
+
+    depth: float32 [H, W] metres. cell: its side in pixels; inside: int64 [S], the rows and columns of a cell that are
+    looked at. out: float32 [H // cell, W // cell].
+    """
+    rows, columns = out.shape
+    none, zero, enough = np.float32(np.inf), np.float32(0), np.int32(inside.shape[0] ** 2 - 1) // 2
+    measured = np.empty(columns, np.int32)
+    for row in range(rows):
+        least = out[row]
+        least[:], measured[:] = none, 0
+        for i in range(inside.shape[0]):
+            for j in range(inside.shape[0]):
+                pixels = depth[row * cell + inside[i], inside[j] :]
+                for column in range(columns):
+                    z = pixels[column * cell]
+                    there = (z > zero) & (z < none)
+                    least[column] = min(least[column], z if there else none)
+                    measured[column] += np.int32(1) if there else np.int32(0)
+        for column in range(columns):
+            least[column] = least[column] if measured[column] > enough else zero
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def compare(near, lens, to_view, seen, front, came, settled):
+    """Note which cells lie in front of what one of the views saw there, and which where one of them saw a surface.
+
+    near: float32 [h, w] depth of the cells. lens: float32 fx, fy, cx, cy in cells. to_view: float32 [V, 3, 4], from
+    their camera's coordinates to those of each view. seen: float32 [V, 2, h, w], the nearest and the farthest depth
+    about each cell of a view. front: float32, metres and share of the depth by which something is nearer that lies in
+    front. came, settled: bool [h, w], False before.
+    """
+    fx, fy, cx, cy = lens
+    rows, columns = near.shape
+    zero, half, one, wide, high = np.float32(0), np.float32(0.5), np.float32(1), np.float32(columns), np.float32(rows)
+    index, ahead = np.empty(columns, np.int32), np.empty(columns, np.float32)
+    for view in range(seen.shape[0]):
+        m00, m01, m02, m03 = to_view[view, 0]
+        m10, m11, m12, m13 = to_view[view, 1]
+        m20, m21, m22, m23 = to_view[view, 2]
+        least, most = seen[view, 0].ravel(), seen[view, 1].ravel()
+        for v in range(rows):
+            depths, down = near[v], (np.float32(v) - cy) * (one / fy)
+            for u in range(columns):
+                depth = depths[u]
+                a, b = (np.float32(u) - cx) * (one / fx) * depth, down * depth
+                z = m20 * a + m21 * b + m22 * depth + m23
+                column = (m00 * a + m01 * b + m02 * depth + m03) * (one / z) * fx + cx + half
+                row = (m10 * a + m11 * b + m12 * depth + m13) * (one / z) * fy + cy + half
+                inside = (depth > zero) & (z > zero)
+                inside &= (column >= zero) & (column < wide) & (row >= zero) & (row < high)
+                index[u] = np.int32(row) * np.int32(columns) + np.int32(column) if inside else np.int32(-1)
+                ahead[u] = z
+            for u in range(columns):
+                i = index[u]
+                if i >= 0 and least[i] > zero:
+                    margin = front[0] + front[1] * least[i]
+                    if ahead[u] < least[i] - margin:
+                        came[v, u] = True
+                    elif ahead[u] < most[i] + margin:
+                        settled[v, u] = True

@@ -1,0 +1,73 @@
+"""The compiled comparison of a frame with earlier views against numpy, written to be read."""
+
+import numpy as np
+import pytest
+
+from ecslam.datasets import open_sequence
+from ecslam.movers import FRONT_M, FRONT_PER_M, SAMPLES, around, cell_lens, cell_px, compare, relief
+from ecslam.rigid import inverse
+
+ROOM = open_sequence("synthetic/apartment?size=320x240&frames=120&visitor=1")
+
+
+def nearest_in_cells(depth: np.ndarray) -> np.ndarray:
+    cell = cell_px(depth)
+    inside = ((np.arange(SAMPLES) + 0.5) * cell / SAMPLES).astype(int)
+    rows, columns = (side // cell * cell for side in depth.shape)
+    looked_at = np.stack([depth[v:rows:cell, u:columns:cell] for v in inside for u in inside])
+    measured = (looked_at > 0) & (looked_at < np.inf)
+    return np.where(2 * measured.sum(0) >= len(measured), np.where(measured, looked_at, np.inf).min(0), 0)
+
+
+def held_against(near: np.ndarray, lens: tuple, c2w: np.ndarray, seen: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """For each cell [h, w]: 2 where a view says that it has come, plus 1 where one saw a surface there; and which cells
+    lie so near to a border of all this that rounding decides."""
+    fx, fy, cx, cy = lens
+    found, close = np.zeros(near.shape, int), np.zeros(near.shape, bool)
+    came, settled = np.zeros((2, *near.shape), bool)
+    v, u = np.indices(near.shape)
+    local = np.stack([(u - cx) / fx * near, (v - cy) / fy * near, near, np.ones_like(near)], -1).astype(np.float64)
+    for pose, (least, most) in zip(poses, seen, strict=True):
+        x, y, z, _ = np.moveaxis(local @ (inverse(pose) @ c2w).T, -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column, row = x / z * fx + cx, y / z * fy + cy
+        inside = (near > 0) & (z > 0) & (abs(column - (near.shape[1] - 1) / 2) < near.shape[1] / 2)
+        inside &= abs(row - (near.shape[0] - 1) / 2) < near.shape[0] / 2
+        at = np.where(inside, np.rint(row), 0).astype(int), np.where(inside, np.rint(column), 0).astype(int)
+        known = inside & (least[at] > 0)
+        margin = FRONT_M + FRONT_PER_M * least[at]
+        came |= known & (z < least[at] - margin)
+        settled |= known & (z >= least[at] - margin) & (z < most[at] + margin)
+        between = np.minimum(abs(column % 1 - 0.5), abs(row % 1 - 0.5)) < 1e-3
+        limits = np.minimum(abs(z - least[at] + margin), abs(z - most[at] - margin)) < 1e-4
+        close |= (near > 0) & (between | limits)
+    found[came] += 2
+    found[settled] += 1
+    return np.where(close, -1, found)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (97, 131), (30, 40), (680, 1200)])
+def test_the_nearest_depth_in_cells_is_that_of_numpy(size):
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.5, 5, size).astype(np.float32)
+    for nothing in (0, np.nan, np.inf):
+        depth[rng.random(size) < 0.15] = nothing
+    depth[: size[0] // 3, : size[1] // 3] = 0
+    assert np.array_equal(relief(depth), nearest_in_cells(depth).astype(np.float32))
+    assert np.array_equal(relief(np.asfortranarray(depth)), relief(depth))
+
+
+@pytest.mark.parametrize("now", [40, 72, 104])
+def test_what_has_come_and_what_is_settled_is_what_numpy_says(now):
+    views = [ROOM[i] for i in range(0, now, 8)]
+    seen, poses = np.stack([around(relief(view.depth)) for view in views]), np.stack([view.c2w_gt for view in views])
+    frame = ROOM[now]
+    lens = cell_lens(ROOM.intrinsics, cell_px(frame.depth))
+    came, settled = compare(relief(frame.depth), lens, frame.c2w_gt, seen, poses)
+    expected = held_against(relief(frame.depth), lens, frame.c2w_gt, seen, poses)
+    sure = expected >= 0
+    assert sure.mean() > 0.8
+    assert np.array_equal((2 * came + settled)[sure], expected[sure])
+    assert came.any()
+    assert settled.any()
+    assert not settled.all()
