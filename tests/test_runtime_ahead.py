@@ -12,6 +12,7 @@ from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import Prefetch, open_sequence
 from ecslam.denoising import denoised
 from ecslam.keyframes import make_keyframe
+from ecslam.movers import relief
 from ecslam.pixels import choose_pixels, feature_points, find_corners
 from ecslam.runtime import ahead
 from ecslam.runtime.ahead import preparation
@@ -25,6 +26,24 @@ def test_corners_are_found_ahead_for_the_frames_that_need_them(preset, found):
     config = load_preset(preset)
     frames = [frame for _, frame in Prefetch(ROOM, prepare=preparation(lambda: config, ROOM.intrinsics, "cpu"))]
     assert [frame.index for frame in frames if frame.corners is not None] == list(found)
+
+
+@pytest.mark.parametrize("movers", ["true", "false"])
+def test_what_tells_movers_is_looked_at_ahead(movers):
+    config = apply_settings(load_preset("live"), [f"movers={movers}"])
+    prepared = preparation(lambda: config, ROOM.intrinsics, "cpu")(ROOM[1])
+    assert (prepared.relief is None) == (movers == "true")
+    if prepared.relief is not None:
+        assert np.array_equal(prepared.relief, relief(prepared.depth))
+
+
+def test_other_depth_has_another_relief():
+    config = apply_settings(load_preset("live"), [])
+    noisy = open_sequence("synthetic/studio?size=160x120&frames=8&noise=1")[0]
+    prepared = preparation(lambda: config, ROOM.intrinsics, "cpu")(noisy)
+    raw = denoised(prepared, apply_settings(config, ["denoise=false"]))
+    assert raw.relief is None
+    assert np.array_equal(raw.depth, noisy.depth)
 
 
 def test_without_fus_nobody_looks_for_corners():

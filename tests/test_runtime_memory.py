@@ -104,3 +104,22 @@ def test_gaps_between_small_blocks_go_back_when_asked():
 
 def test_resident_memory_is_below_its_peak():
     assert 10 < resident_mb() <= peak_memory_mb() + 1
+
+
+IMPORTED = """
+import gc
+from ecslam.runtime.driven import import_slam
+looked = []
+gc.callbacks.append(lambda phase, info: looked.append(info["generation"]))
+import_slam()
+during = looked.count(2)
+import_slam()
+print(gc.isenabled(), during, len(gc.get_objects()), gc.get_freeze_count())
+"""
+
+
+def test_no_search_for_garbage_goes_through_the_libraries():
+    done = subprocess.run([sys.executable, "-c", IMPORTED], capture_output=True, text=True, check=True)
+    enabled, during, searched, left_out = done.stdout.split()
+    assert (enabled, during) == ("True", "0")
+    assert int(searched) < 0.05 * int(left_out)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -108,9 +110,16 @@ class SlamFactory(Protocol):
         ...
 
 
+@cache
 def import_slam() -> None:
-    """Import what ``make_slam`` needs, which takes seconds; any thread may do so ahead of it."""
-    from .. import slam as slam
+    """Import what ``make_slam`` needs, which takes seconds; any thread may do so ahead of it. No search for garbage
+    goes through all that, then or later, which takes a tenth of a second each time."""
+    gc.disable()
+    try:
+        from .. import slam as slam
+    finally:
+        gc.enable()
+    gc.freeze()
 
 
 def make_slam(
@@ -123,6 +132,7 @@ def make_slam(
     state: State | None,
 ) -> SlamLike:
     """The ``SlamFactory`` of ``ecslam.slam.Slam``. torch is imported here and not before."""
+    import_slam()
     import torch
 
     from ..slam import Slam
