@@ -177,18 +177,23 @@ class Mapper:
         interrupt: Callable[[], None],
     ) -> tuple[Tensor, Tensor]:
         """One iteration for each share in ``left`` of the learning rates: the poses and the loss terms [I, 5]."""
-        m, field = job.config.mapping, self.field
-        poses, losses = PoseAdam(c2w, rates, kernels=self.kernels), []
+        m, field, kernels = job.config.mapping, self.field, self.kernels
+        learnt, gradients = _tensors(field.params), _tensors(self._gradients)
+        smooth = job.smooth and m.smooth_weight > 0
+        poses, losses = PoseAdam(c2w, rates, kernels=kernels), []
         for iteration, share in enumerate(left):
             interrupt()
             now = poses.c2w.float()
             rays = draw(iteration, now)
-            result = self.kernels.step(field.layout, field.params, now, rays, job.weights, self._gradients, job.move)
-            if job.smooth and m.smooth_weight > 0:
+            of_table, of_others = self._optimiser.steps(*job.map_rates(share))
+            given = field.layout, field.params, now, rays, job.weights, self._gradients, job.move
+            result = kernels.step(*given, None if smooth else of_table)
+            if smooth:
                 lattice = smooth_lattice(field, m, self._generator)
-                gradient = self.kernels.smoothness(field.layout, field.params.table, lattice)
+                gradient = kernels.smoothness(field.layout, field.params.table, lattice)
                 self._gradients.table.add_(gradient, alpha=m.smooth_weight)
-            self._optimiser.step(_tensors(self._gradients), *job.map_rates(share))
+                kernels.map_step(learnt[:1], gradients[:1], of_table)
+            kernels.map_step(learnt[1:], gradients[1:], of_others)
             field.params.beta.clamp_(min=MIN_BETA)
             if result.d_c2w is not None:
                 poses.step(result.d_c2w, share)

@@ -20,6 +20,7 @@ from kernel_cases import (
 
 from ecslam.config import FieldConfig, MappingConfig
 from ecslam.field import grow_field, map_params
+from ecslam.field_adam import FieldAdam
 from ecslam.kernels import FieldParams, reference
 from ecslam.pose_adam import PoseAdam
 from ecslam.samples import smooth_lattice
@@ -155,6 +156,25 @@ def test_normal_equations(count, colour_weight):
     assert found.cost == pytest.approx(expected.cost, rel=CLOSE)
     assert relative_rms(found.jtj, expected.jtj) < CLOSE
     assert relative_rms(found.jtr, expected.jtr) < CLOSE
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_a_step_that_learns_at_once_is_the_same_as_one_after_the_other(kind):
+    field, (c2w, rays) = make_field(FIELDS[kind]), make_rays(300, 20)
+    at_once, after = (map_params(field.params, torch.clone) for _ in range(2))
+    one, two = FieldAdam([at_once.table]), FieldAdam([after.table])
+    mine, theirs, before = blank(field.params), blank(field.params), torch.randn(field.params.table.shape)
+    for adam, params in ((one, at_once), (two, after)):
+        reference.map_step([params.table], [1e-3 * before], adam.steps(1e-2, 0)[0])
+    found = cpu.step(field.layout, at_once, c2w, rays, WEIGHTS, mine, True, one.steps(1e-2, 0)[0])
+    expected = cpu.step(field.layout, after, c2w, rays, WEIGHTS, theirs, True)
+    reference.map_step([after.table], [theirs.table], two.steps(1e-2, 0)[0])
+    assert torch.equal(found.d_c2w, expected.d_c2w)
+    for name in (f.name for f in fields(FieldParams)):
+        assert torch.equal(getattr(mine, name), getattr(theirs, name)), name
+    for got, wanted in ((at_once.table, after.table), (one.mean[0], two.mean[0]), (one.square[0], two.square[0])):
+        torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-7)
+    assert (at_once.table - field.params.table).abs().min() > 0
 
 
 def everything(field, c2w, rays, points):

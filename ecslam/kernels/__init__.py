@@ -1,4 +1,4 @@
-"""The kernel seam: nine functions, one signature, three back ends.
+"""The kernel seam: ten functions, one signature, three back ends.
 
 ``reference`` (torch, readable, any device), ``cpu`` (numba) and ``gpu`` (Triton). The device picks the back end;
 ``ECSLAM_KERNELS=reference`` or ``with kernels.use("reference")`` overrides. An explicit choice that cannot run raises
@@ -20,6 +20,7 @@ from torch import Tensor
 from ..types import InputError
 from .types import (
     LOSS_NAMES,
+    AdamStep,
     AlignSettings,
     DevicePixels,
     FieldParams,
@@ -34,6 +35,7 @@ from .types import (
 
 __all__ = [
     "LOSS_NAMES",
+    "AdamStep",
     "AlignSettings",
     "Backend",
     "DevicePixels",
@@ -91,8 +93,9 @@ class Backend(Protocol):
         weights: Weights,
         into: FieldParams | None,
         want_poses: bool,
+        adam: AdamStep | None = None,
     ) -> StepResult:
-        """One optimisation step's losses and gradients."""
+        """One optimisation step's losses and gradients, and with ``adam`` the table's own step."""
         ...
 
     def normal_equations(
@@ -109,6 +112,10 @@ class Backend(Protocol):
 
     def pose_step(self, c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, count: int) -> Tensor:
         """Poses [P, 4, 4] after one step of Adam."""
+        ...
+
+    def map_step(self, parameters: list[Tensor], gradients: list[Tensor], adam: AdamStep) -> None:
+        """A step of Adam for parameters of the map, in place."""
         ...
 
     def smoothness(self, layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from ._cpu_adam import adam_range
 from ._cpu_back import TABLE_SCRATCH, features_back, hidden_back, next_level, points_back, table_back, weights_back
-from ._cpu_field import BLOCK, carve, forward
+from ._cpu_field import BLOCK, MASK, OFFSET, carve, forward
 from ._cpu_math import BOTH, HALF, INNER, OUTER, PART, WORKER
 from ._cpu_rays import compare, composite, pose_sums, rendered, sample_points
 from ._cpu_simd import fetch_add
@@ -253,8 +254,11 @@ def backward(grid, net, s, n, pitch, want_params, want_poses, own, a, b):
 
 
 @njit(**WORKER)
-def table_worker(t, counter, kept, buffers, chunk_rays, grid, padded, total, samples, d_table):
-    """Gradient of the whole table from what ``step_worker`` kept: a level belongs to one thread at a time."""
+def table_worker(
+    t, counter, kept, buffers, chunk_rays, grid, padded, total, samples, d_table, table, mean, square, numbers
+):
+    """Gradient of the whole table from what ``step_worker`` kept, and where there are ``numbers`` for it (see
+    ``adam_range``) the table's step: a level belongs to one thread at a time."""
     pitch = up_to_eight(chunk_rays * samples)
     chunks = (total + chunk_rays - 1) // chunk_rays
     scratch = buffers[t, :TABLE_SCRATCH]
@@ -266,6 +270,10 @@ def table_worker(t, counter, kept, buffers, chunk_rays, grid, padded, total, sam
             n = up_to_eight(min(chunk_rays, total - chunk * chunk_rays) * samples)
             x, d_enc = kept[chunk, : 6 * pitch], kept[chunk, 6 * pitch :]
             table_back(grid, level, x, d_enc, 2 * level * pitch, n, pitch, scratch, d_table)
+        if numbers.shape[0]:
+            start = 2 * grid.levels[level, OFFSET]
+            stop = start + 2 * grid.levels[level, MASK] + 2
+            adam_range(table, d_table, mean, square, numbers, start, stop)
 
 
 @njit(**OUTER)

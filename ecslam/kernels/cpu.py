@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..compiled import drop_stale
+from ._cpu_adam import adam_worker
 from ._cpu_back import TABLE_SCRATCH
 from ._cpu_field import Grid, Net, scratch_floats
 from ._cpu_math import BOTH, HALF
@@ -42,7 +43,17 @@ from ._cpu_work import (
 from .denormals import flushed
 from .depths_cpu import importance_depths as importance_depths
 from .depths_cpu import sample_depths as sample_depths
-from .types import AlignSettings, FieldParams, GridLayout, NormalEquations, PoseMoments, RayBatch, StepResult, Weights
+from .types import (
+    AdamStep,
+    AlignSettings,
+    FieldParams,
+    GridLayout,
+    NormalEquations,
+    PoseMoments,
+    RayBatch,
+    StepResult,
+    Weights,
+)
 
 drop_stale(Path(__file__).parent, step_worker.stats.cache_path, "_cpu_*")
 
@@ -204,8 +215,9 @@ def step(
     weights: Weights,
     into: FieldParams | None,
     want_poses: bool,
+    adam: AdamStep | None = None,
 ) -> StepResult:
-    """See ``reference.step``."""
+    """See ``reference.step``; a level's rows take their step as soon as their gradient is there."""
     count, samples = rays.z.shape
     chunks = -(-count // CHUNK_RAYS)
     net, grid, batch = _net(layout, params), _grid(layout), _rays(c2w, rays)
@@ -222,18 +234,12 @@ def step(
             into is not None, want_poses, losses, partial, sums,
         )  # fmt: skip
     if into is not None:
+        table = params.table, *((adam.mean[0], adam.square[0]) if adam else (into.table, into.table))
         _spread(
-            threads,
-            table_worker,
-            keep,
-            buffers,
-            CHUNK_RAYS,
-            grid,
-            net.padded,
-            count,
-            samples,
-            into.table.numpy().reshape(-1),
-        )
+            threads, table_worker, keep, buffers, CHUNK_RAYS, grid, net.padded, count, samples,
+            *(tensor.numpy().reshape(-1) for tensor in (into.table, *table)),
+            _adam_numbers(adam) if adam else np.empty(0, np.float32),
+        )  # fmt: skip
         targets = (t.numpy() for t in (into.w_in, into.w_sdf, into.w_rgb, into.beta))
         add_partials(partial, 2 * layout.levels, layout.bins, net.padded, *targets)
     d_c2w = torch.empty(c2w.shape[0], 3, 4) if want_poses else None
@@ -280,6 +286,20 @@ def pose_step(c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, c
     state = moments.mean.numpy(), moments.square.numpy(), rates.contiguous().numpy()
     pose_worker(poses, pulls, *state, about, moments.decays, moments.epsilon, count, moved.numpy())
     return moved
+
+
+def map_step(parameters: list[Tensor], gradients: list[Tensor], adam: AdamStep) -> None:
+    """See ``reference.map_step``."""
+    numbers = _adam_numbers(adam)
+    for several in zip(parameters, gradients, adam.mean, adam.square, strict=True):
+        adam_worker(*(tensor.numpy().reshape(-1) for tensor in several), numbers)
+
+
+def _adam_numbers(adam: AdamStep) -> Floats:
+    """What ``adam_range`` wants."""
+    (first, second), count = adam.decays, float(adam.count)
+    corrected = float(adam.rate) / (1 - first**count), math.sqrt(1 - second**count)
+    return np.array([*corrected, first, second, adam.epsilon], np.float32)
 
 
 def smoothness(layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:

@@ -18,7 +18,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .types import HIDDEN, AlignSettings, FieldParams, GridLayout, NormalEquations, RayBatch, StepResult, Weights
+from .types import (
+    HIDDEN,
+    AdamStep,
+    AlignSettings,
+    FieldParams,
+    GridLayout,
+    NormalEquations,
+    RayBatch,
+    StepResult,
+    Weights,
+)
 
 if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
     raise ImportError("no CUDA device")
@@ -30,6 +40,7 @@ from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, place_kerne
 from ._gpu_rays import Targets, losses_kernel, render_kernel
 from .depths_gpu import importance_depths as importance_depths
 from .poses_gpu import pose_step as pose_step
+from .reference import map_step as map_step
 from .reference import smoothness as smoothness
 from .reference_depths import sample_depths as sample_depths
 
@@ -186,6 +197,7 @@ def step(
     weights: Weights,
     into: FieldParams | None,
     want_poses: bool,
+    adam: AdamStep | None = None,
 ) -> StepResult:
     """See ``reference.step``. Never waits for the device."""
     targets, poses = _targets(rays), c2w.shape[0]
@@ -196,6 +208,8 @@ def step(
         torch._foreach_zero_([out, *learnt])
         if targets.z.numel():
             _step(layout, params, _samples(c2w, rays), targets, weights, into, losses, d_c2w if want_poses else None)
+    if into is not None and adam is not None:
+        map_step([params.table], [into.table], adam)
     return StepResult(losses, d_c2w if want_poses else None)
 
 

@@ -14,6 +14,7 @@ from .reference_depths import sample_depths as sample_depths
 from .types import (
     FEATURES,
     HIDDEN,
+    AdamStep,
     AlignSettings,
     FieldParams,
     GridLayout,
@@ -173,8 +174,10 @@ def step(
     weights: Weights,
     into: FieldParams | None,
     want_poses: bool,
+    adam: AdamStep | None = None,
 ) -> StepResult:
-    """Render, compare, differentiate. Parameter gradients overwrite ``into`` unless it is None."""
+    """Render, compare, differentiate. Parameter gradients overwrite ``into`` unless it is None; with ``adam`` the table
+    takes its step as well."""
     with torch.enable_grad():
         names = FieldParams.__dataclass_fields__
         leaves = {n: getattr(params, n).detach().requires_grad_(into is not None) for n in names}
@@ -186,6 +189,8 @@ def step(
     if into is not None:
         for name, gradient in zip(names, found, strict=False):
             getattr(into, name).copy_(gradient)
+        if adam is not None:
+            map_step([params.table], [into.table], adam)
     return StepResult(terms.detach(), found[-1] if want_poses else None)
 
 
@@ -233,6 +238,26 @@ def pose_step(c2w: Tensor, d_c2w: Tensor, moments: PoseMoments, rates: Tensor, c
     square.mul_(decays[1]).addcmul_(gradient, gradient, value=1 - decays[1])
     first, second = mean / (1 - decays[0] ** count), square / (1 - decays[1] ** count)
     return se3.retract(c2w, -rates * first / (second.sqrt() + moments.epsilon), moments.about)
+
+
+def map_step(parameters: list[Tensor], gradients: list[Tensor], adam: AdamStep) -> None:
+    """Take a step for ``parameters``, in place; all float32 on one device. One launch on a GPU, however many there are:
+    torch's fused update, without the seconds that importing ``torch.optim``'s compiler support costs."""
+    torch._fused_adam_(
+        parameters,
+        gradients,
+        adam.mean,
+        adam.square,
+        [],
+        [adam.count] * len(parameters),
+        lr=adam.rate,
+        beta1=adam.decays[0],
+        beta2=adam.decays[1],
+        weight_decay=0.0,
+        eps=adam.epsilon,
+        amsgrad=False,
+        maximize=False,
+    )
 
 
 def smoothness(layout: GridLayout, table: Tensor, lattice: Tensor) -> Tensor:

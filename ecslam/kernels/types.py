@@ -181,6 +181,20 @@ class PoseMoments:
 
 
 @dataclass(frozen=True)
+class AdamStep:
+    """A step of Adam (Kingma and Ba 2015) for some of the map's parameters. mean, square: its moments, float32, one a
+    parameter, brought up to date by the step. count: float32 [], steps done with this one. rate: the learning rate, a
+    number or a tensor []. decays, epsilon: Adam's."""
+
+    mean: list[Tensor]
+    square: list[Tensor]
+    count: Tensor
+    rate: float | Tensor
+    decays: tuple[float, float]
+    epsilon: float
+
+
+@dataclass(frozen=True)
 class NormalEquations:
     """Gauss-Newton sums over points, in the tangent of ``se3.retract``. jtj: float64 [6, 6]; jtr: float64 [6]; cost:
     robust objective (sum over used points); used: points that took part; inliers: those with weight above one half."""
