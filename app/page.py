@@ -24,11 +24,16 @@ _POLICY = (
     "connect-src 'self' ws://{host} wss://{host} blob: data:; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'none'"
 )
-# A button that was clicked keeps the focus, and the hot key space would press it again: let go of it. One that the
-# keyboard has reached is pressed with space, which is no hot key then.
+# A control that was clicked keeps the focus, and would take the next key for its own: let go of it. One that the
+# keyboard has reached keeps the keys it needs: space presses a button or ticks a box, and is no hot key then. A tab
+# needs none but the arrows and Enter; all others are hot keys, as everywhere but in a field that one types in.
 _FOCUS = (
-    "addEventListener('click',e=>{if(e.detail&&e.target.closest('button'))document.activeElement.blur()});"
-    "addEventListener('keydown',e=>{if(e.key===' '&&e.target.closest('button'))e.stopPropagation()},true)"
+    "addEventListener('click',e=>{if(e.detail&&e.target.closest('button,label,[role=tab],[role=option],"
+    "[type=checkbox]'))setTimeout(()=>document.activeElement.blur())});"
+    "addEventListener('keydown',e=>{if(e.ctrlKey||e.metaKey||e.altKey)return;const space=e.key===' ',"
+    "on=kind=>e.target.closest(kind);if(space&&on('button'))e.stopPropagation();"
+    "else if(space?on('[role=tab]'):e.key.length===1&&on('[type=checkbox]')){e.preventDefault();e.stopPropagation();"
+    "document.body.dispatchEvent(new KeyboardEvent('keydown',e))}},true)"
 )
 # A finger captures the canvas by itself when it touches it, which viser takes for a gizmo being dragged: a tap would be
 # no click.

@@ -238,6 +238,7 @@ def test_the_plots_of_a_replay_mark_the_frame_that_is_shown(replay_page):
     frames, values, upright = chart._plot.data
     assert frames[np.isfinite(values)].tolist() == sorted([*range(30), 23])
     assert upright[np.isfinite(upright)].tolist() == [0.0, chart._plot.scales["y"]["range"][1]]
+    assert chart._plot.series[-1]["points"]["show"] is False, "in a short run its two ends would be circled"
     assert len(chart._plot.series) == 3
 
 

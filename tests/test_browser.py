@@ -205,6 +205,47 @@ def test_pause_step_resume_and_hot_keys(live):
     visit.state("Paused")
 
 
+def test_hot_keys_work_wherever_the_focus_is_but_in_a_field(browser, tmp_path):
+    dashboard = server.view([write_run(tmp_path / "run", 60)], port=0)
+    visit = Visit(browser, dashboard)
+    page, box = visit.page, visit.page.get_by_label("Keyframes", exact=True)
+
+    def plays():
+        dashboard.engine.submit(m.RunTo(20))
+        visit.wait(lambda: visit.frame == 20)
+        page.keyboard.press("n")
+        visit.wait(lambda: visit.frame == 21)
+        page.keyboard.press("Space")
+        visit.wait(lambda: visit.frame > 22)
+
+    try:
+        for act in (
+            lambda: visit.tab("Plots"),
+            lambda: page.get_by_role("tab", name="Run").focus(),
+            lambda: (visit.tab("View"), visit.tick("Keyframes")),
+            lambda: visit.choose("Mesh", "Normals"),
+        ):
+            act()
+            plays()
+        assert not box.is_checked(), "space has left alone what was clicked"
+        dashboard.engine.submit(m.RunTo(20))
+        box.focus()
+        page.keyboard.press("n")
+        visit.wait(lambda: visit.frame == 21)
+        page.keyboard.press("Space")
+        visit.wait(box.is_checked)
+        visit.tab("Run")
+        page.get_by_role("textbox").first.click()
+        for key in ("n", "Space"):
+            page.keyboard.press(key)
+        page.wait_for_timeout(1000)
+        assert visit.frame == 21
+    finally:
+        page.close()
+        dashboard.close()
+    assert visit.errors == []
+
+
 def test_switch_preset_and_start_over(live):
     engine, visit = live
     visit.choose("Preset", "full")

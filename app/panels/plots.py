@@ -21,9 +21,16 @@ X_AXIS_PX, Y_AXIS_PX = 36, 46
 _WHOLE = tuple(k * 10**n for n in range(7) for k in (1, 2, 5))
 _RESIDUAL = "_mm"  # ends the names of what is measured in millimetres and therefore no loss
 _PALETTE = (theme.ESTIMATE, theme.TRUTH, theme.WINDOW, theme.LOOP, (234, 179, 8), theme.BEFORE, theme.KEYFRAME)
-# Its class keeps it out of the legend and without a point under the mouse.
+# Its class keeps it out of the legend and without a point under the mouse; a line has no points at its two ends.
 _UPRIGHT = cast(
-    uplot.Series, {"label": "shown", "class": "ec-upright", "stroke": theme.css(theme.KEYFRAME), "width": 1.2}
+    uplot.Series,
+    {
+        "label": "shown",
+        "class": "ec-upright",
+        "stroke": theme.css(theme.KEYFRAME),
+        "width": 1.2,
+        "points": uplot.Series_Points(show=False),
+    },
 )
 
 
