@@ -32,6 +32,7 @@ from websockets.http11 import Request, Response
 
 from .broadcast import share_batches
 from .guard import make_check
+from .listen import EVERYWHERE
 from .page import index_page
 
 MAX_CLIENTS = 64
@@ -93,7 +94,7 @@ def is_loopback(host: str) -> bool:
 def open_viser(listener: socket.socket, host: str, token: str | None, label: str) -> viser.ViserServer:
     """A viser server on ``listener`` behind the checks. Raises RuntimeError if viser cannot be wrapped."""
     port = listener.getsockname()[1]
-    everywhere = host in ("0.0.0.0", "::", "")
+    everywhere = host in EVERYWHERE
     own_names = (socket.gethostname(), socket.getfqdn()) if everywhere else (host,)
     door = Door(_LOOPBACK_NAMES | {name.lower() for name in own_names}, everywhere, token, f"ecslam_{port}")
     shell = _Shell(door, listener)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import ipaddress
 import os
 import socket
 
 from ecslam.types import InputError
+
+EVERYWHERE = ("0.0.0.0", "::", "")
+# Nothing is sent to these: they only ask the system which of this machine's addresses would be the sender's.
+_FAR_AWAY = {socket.AF_INET: "192.0.2.1", socket.AF_INET6: "2001:db8::1"}
 
 
 def bind(host: str, port: int) -> socket.socket:
@@ -31,3 +37,20 @@ def bind(host: str, port: int) -> socket.socket:
         hint = "choose another --port (0 takes any free one)" if port else "choose an address of this machine"
         raise InputError(f"--host {host} --port {port}: cannot listen there ({error.strerror}); {hint}") from None
     return listener
+
+
+def names_elsewhere(listener: socket.socket) -> tuple[str, ...]:
+    """Under which addresses and which name other machines may know this one, for a socket on all of its networks."""
+    both = listener.family == socket.AF_INET6 and not listener.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY)
+    families = (socket.AF_INET, socket.AF_INET6) if both else (listener.family,)
+    addresses = (_own_address(family) for family in families)
+    return tuple(name for name in (*addresses, socket.gethostname()) if name and name != "localhost")
+
+
+def _own_address(family: int) -> str:
+    """The address of this machine that others see; "" without a network."""
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as asked:
+        asked.connect((_FAR_AWAY[socket.AddressFamily(family)], 9))
+        address = str(asked.getsockname()[0])
+        return "" if ipaddress.ip_address(address).is_loopback else address
+    return ""

@@ -13,7 +13,7 @@ from ecslam.types import InputError
 
 from .front import close_viser, is_loopback, open_viser
 from .hub import Hub
-from .listen import bind
+from .listen import EVERYWHERE, bind, names_elsewhere
 from .replay import ReplayEngine
 from .runs import load_run, truth_apart
 
@@ -24,9 +24,11 @@ SAME_TRUTH_M = 1e-3
 
 @dataclass(frozen=True)
 class Dashboard:
-    """A running dashboard. url: the address to open, token included. host, port: where it listens, as numbers."""
+    """A running dashboard. url: the address to open, token included; elsewhere: those to open on another machine.
+    host, port: where it listens, as numbers."""
 
     url: str
+    elsewhere: tuple[str, ...]
     host: str
     port: int
     hub: Hub
@@ -72,9 +74,13 @@ def start(
     hub = Hub(engine, server, dark)
     hub.start()
     address, bound = listener.getsockname()[:2]
-    shown = "localhost" if host in ("0.0.0.0", "::", "127.0.0.1") else _in_url(host)
-    url = f"http://{shown}:{bound}/" + (f"?token={token}" if token else "")
-    return Dashboard(url, address, bound, hub, engine)
+
+    def url(name: str) -> str:
+        return f"http://{_in_url(name)}:{bound}/" + (f"?token={token}" if token else "")
+
+    here = "localhost" if host in (*EVERYWHERE, "127.0.0.1") else host
+    others = names_elsewhere(listener) if host in EVERYWHERE else () if is_loopback(host) else (host,)
+    return Dashboard(url(here), tuple(map(url, others)), address, bound, hub, engine)
 
 
 def _in_url(host: str) -> str:

@@ -302,7 +302,8 @@ def _progress() -> Progress:
 
 def _announce(dashboard: Any, browser: bool, at_the_end: str) -> None:
     console.print(f"Dashboard: {dashboard.url}", soft_wrap=True)
-    console.print(f"From another machine: {dashboard.ssh_hint}", soft_wrap=True)
+    ways = "\nor: ".join((*dashboard.elsewhere, dashboard.ssh_hint))
+    console.print(f"From another machine: {ways}", soft_wrap=True)
     console.print(f"Ctrl-C ends it; {at_the_end}.")
     if browser:
         _open(dashboard.url)

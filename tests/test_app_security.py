@@ -12,7 +12,7 @@ import msgspec
 import pytest
 import viser
 from ecslam_app import front, guard, server
-from ecslam_app.listen import bind
+from ecslam_app.listen import bind, names_elsewhere
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -322,6 +322,52 @@ def test_the_tunnel_leads_to_the_page(engine, host):
             tunnel.sendall(f"GET {urlsplit(address).path}?{urlsplit(address).query} HTTP/1.1\r\n".encode())
             tunnel.sendall(f"Host: {urlsplit(address).netloc}\r\n\r\n".encode())
             assert tunnel.recv(12) in (b"HTTP/1.1 200", b"HTTP/1.1 303")
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_an_open_page_says_under_which_addresses_other_machines_find_it(engine, host, monkeypatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "here")
+    try:
+        listener = bind(host, 0)
+    except InputError:
+        pytest.skip(f"this machine has no {host}")
+    page = server.start(engine, host=host, listener=listener)
+    try:
+        *addresses, name = page.elsewhere
+        assert name == page.url.replace("localhost", "here")
+        for address in (*addresses, name):
+            there = urlsplit(address)
+            assert not front.is_loopback(there.hostname)
+            assert get(page, f"/?{there.query}", Host=there.netloc)[0].status == 303
+    finally:
+        page.close()
+
+
+def test_addresses_elsewhere_are_those_that_this_machine_sends_from(monkeypatch):
+    class Sender:
+        def __init__(self, family, kind):
+            self.own = {socket.AF_INET: "192.0.2.7", socket.AF_INET6: "2001:db8::7"}[family]
+
+        __enter__, __exit__, connect = (lambda self: self), (lambda self, *_: None), (lambda self, far: None)
+
+        def getsockname(self):
+            return self.own, 9
+
+    with bind("0.0.0.0", 0) as listener:
+        monkeypatch.setattr(socket, "socket", Sender)
+        monkeypatch.setattr(socket, "gethostname", lambda: "localhost")
+        assert names_elsewhere(listener) == ("192.0.2.7",)
+        monkeypatch.setattr(Sender, "connect", lambda self, far: (_ for _ in ()).throw(OSError("no network")))
+        assert names_elsewhere(listener) == ()
+
+
+@pytest.mark.parametrize(("host", "count"), [("127.0.0.1", 0), ("localhost", 0), ("192.0.2.9", 1)])
+def test_one_address_is_the_same_from_everywhere(engine, host, count):
+    page = server.start(engine, host=host, listener=bind("127.0.0.1", 0))
+    try:
+        assert list(page.elsewhere) == count * [page.url]
     finally:
         page.close()
 

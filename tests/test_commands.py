@@ -88,14 +88,18 @@ def test_the_port_that_was_found_free_is_the_one_that_the_page_has(tmp_path):
     assert page.port == found
 
 
-PAGE = SimpleNamespace(url="http://[fd00::5]:8080/?token=t", ssh_hint="ssh -L 8080:[fd00::5]:8080 <this machine>")
+PAGE = SimpleNamespace(
+    url="http://localhost:8080/?token=t",
+    elsewhere=("http://[fd00::5]:8080/?token=t", "http://here:8080/?token=t"),
+    ssh_hint="ssh -L 8080:[fd00::5]:8080 <this machine>",
+)
 
 
 def test_addresses_and_paths_in_brackets_are_said_whole(tmp_path, capsys):
     commands._announce(PAGE, False, "nothing is lost")
     commands.write_synthetic("synthetic/studio?size=32x24&frames=1", tmp_path / "[raw]", "")
     said = "".join(capsys.readouterr().out.split())
-    for words in (PAGE.url, PAGE.ssh_hint, str(tmp_path / "[raw]")):
+    for words in (PAGE.url, *PAGE.elsewhere, PAGE.ssh_hint, str(tmp_path / "[raw]")):
         assert words.replace(" ", "") in said
 
 
