@@ -23,6 +23,7 @@ from ecslam import cli, commands, reports
 from ecslam.bench import accuracy, speed
 from ecslam.config_files import apply_settings, load_config, load_preset
 from ecslam.datasets.meshes import load_mesh
+from ecslam.evaluation import plots
 from ecslam.reports import draw_picture
 from ecslam.runtime.mesh_files import mesh_bytes
 from ecslam.types import InputError, Mesh
@@ -278,6 +279,19 @@ def test_a_full_disk_at_the_picture_is_a_warning(finished, tmp_path, capsys, mon
     assert "warning: picture.png was not made: [Errno 28] No space left on device" in said
     assert str(folder / "summary.json") in said
     assert not (folder / "picture.png").exists()
+
+
+def test_the_picture_numbers_frames_as_the_dashboard_does(finished, tmp_path, monkeypatch):
+    folder, numbers = shutil.copytree(finished, tmp_path / "run"), []
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    skipped = [{**row, "frame": row["frame"] + (row["frame"] > 3)} for row in rows]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in skipped))
+    monkeypatch.setattr(plots, "plot_run", lambda *given: numbers.append(given[-1]))
+    draw_picture(folder)
+    (folder / "metrics.jsonl").unlink()
+    draw_picture(folder)
+    assert numbers[0].tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
+    assert numbers[1] is None, "of a run whose rows could not be saved"
 
 
 def test_a_run_without_a_surface_ends_without_a_picture(finished, tmp_path):

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.axes import Axes
 from scipy.spatial.transform import Rotation
 
 from ecslam.evaluation.dollhouse import dollhouse, floor_plan, visible_pixels
@@ -92,3 +93,12 @@ def test_a_picture_is_written(tmp_path: Path, case: str) -> None:
     left = image[130:, :1250].astype(int)
     green = (left[..., 1] > 1.5 * left[..., 0]) & (left[..., 1] > 1.5 * left[..., 2])
     assert (green.mean() > 0.05) == (case != "no mesh")
+
+
+def test_errors_are_drawn_at_the_numbers_of_their_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    monkeypatch.setattr(Axes, "fill_between", lambda axes, x, y, **style: drawn.append(list(x)))
+    estimate, frames = poses(4), np.array([0, 1, 5, 7])
+    plot_run(tmp_path / "run.png", EMPTY, estimate, poses(4), frames=frames)
+    plot_run(tmp_path / "run.png", EMPTY, estimate, poses(4))
+    assert drawn == [[0, 1, 5, 7], [0, 1, 2, 3]]

@@ -25,12 +25,17 @@ Poses = NDArray[np.float64]
 
 
 def plot_run(
-    into: Path | IO[bytes], mesh: Mesh, poses_est: Poses, poses_gt: Poses | None = None, title: str = ""
+    into: Path | IO[bytes],
+    mesh: Mesh,
+    poses_est: Poses,
+    poses_gt: Poses | None = None,
+    title: str = "",
+    frames: NDArray[np.int64] | None = None,
 ) -> None:
     """Write a PNG: left the mesh, seen into from above, with the path of the camera; right trajectories and errors.
 
     poses_est: [N, 4, 4] camera-to-world in the world of the mesh. poses_gt: the same for the truth, NaN where unknown,
-    or None: then the right side shows the estimate alone.
+    or None: then the right side shows the estimate alone. frames: [N] their numbers, where some were skipped.
     """
     poses_est = np.asarray(poses_est, np.float64)
     finite = poses_est[np.isfinite(poses_est).all((1, 2))]
@@ -44,7 +49,8 @@ def plot_run(
         _draw_above(figure.add_axes((0.70, 0.12, 0.28, 0.70)), poses_est, None, None, up)
     else:
         _draw_above(figure.add_axes((0.70, 0.43, 0.28, 0.42)), poses_est, poses_gt, error, up)
-        _draw_errors(figure.add_axes((0.70, 0.09, 0.28, 0.22)), error)
+        numbers = np.arange(len(poses_est)) if frames is None else frames
+        _draw_errors(figure.add_axes((0.70, 0.09, 0.28, 0.22)), error, numbers)
     figure.savefig(into, format="png")
 
 
@@ -98,15 +104,14 @@ def _draw_above(
     axes.legend(frameon=False, fontsize=9, labelcolor=INK, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.06))
 
 
-def _draw_errors(axes: Axes, error: AbsoluteError) -> None:
-    frames = np.arange(len(error.errors_cm))
+def _draw_errors(axes: Axes, error: AbsoluteError, frames: NDArray[np.int64]) -> None:
     axes.fill_between(frames, error.errors_cm, color=ACCENT, alpha=0.15, lw=0)
     axes.plot(frames, error.errors_cm, color=ACCENT, lw=1.2)
     axes.axhline(error.cm.rmse, color=INK, lw=1, ls=(0, (4, 3)))
     axes.text(frames[-1], error.cm.rmse, "RMSE ", color=INK, size=9, ha="right", va="bottom")
-    axes.set_xlim(0, max(1, len(frames) - 1))
+    axes.set_xlim(0, max(1, frames[-1]))
     axes.set_ylim(0, 1.1 * error.cm.max + 1e-6)
-    axes.set_xlabel("frame, without those skipped", color=MUTED)
+    axes.set_xlabel("frame", color=MUTED)
     _style(axes, "Position error after alignment (cm)")
 
 
