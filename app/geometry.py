@@ -74,6 +74,11 @@ def rotation_to(up: Array) -> Array:
     return np.asarray(vt.SO3.exp(axis).wxyz)
 
 
+def standing(up: Array, front: Array) -> Array:
+    """Quaternion [4] that turns +y into ``up`` and +z into ``front``, unit vectors square to each other."""
+    return np.asarray(vt.SO3.from_matrix(np.stack([np.cross(up, front), up, front], 1)).wxyz)
+
+
 def overview(points: Array, up: Array, side: Array, aspect: float, fov_y: float) -> tuple[Array, Array]:
     """``seen_from`` for ``points`` seen obliquely from above; side: horizontal direction [3] towards the viewer."""
     return seen_from(points, up, 0.62 * side / np.linalg.norm(side) + 0.78 * up, aspect, fov_y)

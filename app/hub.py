@@ -117,6 +117,7 @@ class Hub:
             brand_color=theme.ACCENT,
         )
         self.scene.set_dark(self.dark)
+        self.views.walls.set_dark(self.dark)
 
     # ---- what panels use -----------------------------------------------------------------------------------------
 

@@ -30,6 +30,7 @@ from .geometry import (
     wxyz,
 )
 from .glb import simplify, to_glb, vertex_normals
+from .grids import GAP_M, add_grid, paint
 
 MESH_MODES = ("Colour", "Normals", "Wireframe", "Off")
 FRUSTUM_M, CAMERA_M = 0.09, 0.28
@@ -61,19 +62,7 @@ class Scene:
         self._guessed_up = self.up
         self._best_side: NDArray[np.float64] | None = None
         server.scene.configure_default_lights(cast_shadow=False)
-        self._grid = server.scene.add_grid(
-            "/grid",
-            24,
-            24,
-            cell_size=0.5,
-            section_size=2.0,
-            cell_color=theme.GRID[0],
-            section_color=theme.GRID[0],
-            cell_thickness=0.5,
-            section_thickness=0.8,
-            fade_distance=22,
-            shadow_opacity=0.0,
-        )
+        self._grid = add_grid(server.scene, "/grid")
         self._lines = {
             name: server.scene.add_line_segments(
                 f"/{name}", _NO_LINES, color, thickness=width, thickness_units="screen"
@@ -103,6 +92,11 @@ class Scene:
     def side(self) -> NDArray[np.float64]:
         """The horizontal direction [3] from what there is to see towards where it is seen best."""
         return self._back if self._best_side is None else self._best_side
+
+    @property
+    def floor(self) -> NDArray[np.float64]:
+        """The middle [3] of the floor's grid."""
+        return np.array(self._grid.position)
 
     # ---- what is drawn -------------------------------------------------------------------------------------------
 
@@ -148,7 +142,7 @@ class Scene:
         low, high = np.percentile(self._mesh.vertices, (1, 99), axis=0)
         some = self._mesh.vertices[:: max(1, len(self._mesh.vertices) // SAMPLE)].astype(float)
         self.points = np.concatenate([some.clip(low, high), self._walked])
-        self._grid.position = (low + high) / 2 + (float(((some - (low + high) / 2) @ self.up).min()) - 0.02) * self.up
+        self._grid.position = (low + high) / 2 + (float(((some - (low + high) / 2) @ self.up).min()) - GAP_M) * self.up
         self._draw_mesh()
 
     def _stand_upright(self, mesh: Mesh) -> None:
@@ -164,7 +158,7 @@ class Scene:
 
     def set_dark(self, dark: bool) -> None:
         """Draw the floor's grid for a dark or a light page."""
-        self._grid.cell_color = self._grid.section_color = theme.GRID[dark]
+        paint(self._grid, dark)
 
     def set_mode(self, mode: str) -> None:
         """Show the mesh as one of ``MESH_MODES``."""

@@ -16,7 +16,7 @@ BEFORE: RGB = (239, 68, 68)
 OTHER: RGB = (20, 184, 166)
 MEASURE: RGB = (124, 58, 237)
 ACCENT: RGB = (234, 88, 12)
-GRID: tuple[RGB, RGB] = (214, 220, 228), (58, 64, 74)  # light, dark
+GRID: tuple[RGB, RGB] = (198, 206, 216), (58, 64, 74)  # light, dark
 
 STATE_COLORS: dict[str, RGB] = {
     "idle": KEYFRAME,

@@ -10,6 +10,7 @@ import viser
 from numpy.typing import NDArray
 
 from .geometry import behind, distance_to_path, overview, seen_from, square_side
+from .grids import WallGrids
 from .scene import Scene
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ class Views:
     """Moves viewers' cameras. Only the hub's thread calls these methods."""
 
     def __init__(self, server: viser.ViserServer, scene: Scene) -> None:
-        self._server, self._scene = server, scene
+        self._server, self._scene, self.walls = server, scene, WallGrids(server)
         self._framed: dict[int, _Framing] = {}
         self._points = scene.points
         self._places: dict[float, tuple[Array, Array]] = {}
@@ -65,6 +66,7 @@ class Views:
 
     def show_all(self, client: viser.ClientHandle, seconds: float = GLIDE_S) -> None:
         """Bring everything into one viewer's sight, and keep it there as the map grows."""
+        self.walls.take_down(client)
         place = self._all(client)
         self._framed[client.client_id] = _Framing(*place, self._way(client, place[0], REMEMBERED))
         self._fly(client, *place, seconds)
@@ -96,7 +98,8 @@ class Views:
         self._fly(client, *self._overview(points, client.camera.aspect), GLIDE_S)
 
     def straight(self, client: viser.ClientHandle, above: bool) -> None:
-        """Show one viewer everything as a drawing does: from above, or from the side, square to the nearest walls."""
+        """Show one viewer everything as a drawing does: from above, or from the side, square to the nearest walls and
+        before a grid."""
         scene, mesh = self._scene, self._scene.mesh
         if mesh is None:
             self.show_all(client)
@@ -107,6 +110,9 @@ class Views:
         self._leave(client)
         back = scene.up + LEAN * side if above else side
         place = seen_from(scene.points, scene.up, back, client.camera.aspect or 1.5, STRAIGHT_FOV_RAD)
+        if not above:
+            depth = -float(((mesh.vertices - scene.floor) @ side).min())
+            self.walls.put_up(client, scene.floor, scene.up, side, depth)
         self._fly(client, *place, GLIDE_S, STRAIGHT_FOV_RAD)
 
     def visit(self, client: viser.ClientHandle, c2w: Array) -> None:
@@ -116,6 +122,7 @@ class Views:
 
     def follow(self, client: viser.ClientHandle, c2w: Array) -> None:
         """Put one viewer just behind the run's camera, and keep it there until the viewer moves or goes elsewhere."""
+        self.walls.take_down(client)
         place = behind(c2w, self._scene.up)
         way = self._way(client, place[0], REMEMBERED_BEHIND)
         self._framed[client.client_id] = _Framing(*place, way, follows=True)
@@ -135,6 +142,7 @@ class Views:
         return np.stack([*before, np.array(client.camera.position), position])[-most:]
 
     def _leave(self, client: viser.ClientHandle) -> None:
+        self.walls.take_down(client)
         self._framed.pop(client.client_id, None)
 
     def _all(self, client: viser.ClientHandle) -> tuple[Array, Array]:

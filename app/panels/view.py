@@ -51,7 +51,7 @@ class Panel(BasePanel):
         straight = gui.add_button_group(
             "Look from",
             ("Above", "The side"),
-            hint="For you alone: a floor plan, whose grid has a line every half metre, or square to the walls",
+            hint="For you alone: a floor plan, or straight at a wall; the grid has a line every half metre",
         )
         hub.on(straight, lambda event: hub.views.straight(event.client, straight.value == "Above"))
 
