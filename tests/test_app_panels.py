@@ -257,10 +257,31 @@ def test_a_loop_is_inspected_only_while_it_has_happened(replay_page):
             replay_page.engine.submit(m.RunTo(frame))
             assert until(lambda frame=frame: replay_page.hub.current.frame == frame)
             if inspected:
+                assert until(lambda: control(replay_page, "Go to")[1].visible)
                 press(replay_page, client, "Go to", "Next event")
                 assert until(lambda: scene._inspected is not None)
             assert until(lambda inspected=inspected: (scene._inspected is not None) == inspected)
             assert choice.value.startswith("Frame 27") == inspected
+
+
+def test_loops_are_offered_only_once_there_are_any(replay_page):
+    panel = next(p for p in replay_page.hub.panels if isinstance(p, Loops))
+    for frame, some in ((20, False), (29, True)):
+        replay_page.engine.submit(m.RunTo(frame))
+        assert until(lambda frame=frame: replay_page.hub.current.frame == frame)
+        assert until(lambda some=some: panel._steps.visible is some)
+        assert panel._choice.visible is panel._legend.visible is some
+        assert ("None has closed" in panel._html.content) is not some
+
+
+def test_a_replay_scrubbed_back_says_what_its_exports_are_of(replay_page):
+    note = next(p for p in replay_page.hub.panels if p.tab == "Export")._whole
+    replay_page.engine.submit(m.RunTo(20))
+    assert until(lambda: note.visible)
+    assert "frames 0 to 29" in note.content
+    assert "frame 20." in note.content
+    replay_page.engine.submit(m.RunTo(29))
+    assert until(lambda: not note.visible)
 
 
 def test_without_ground_truth_nothing_on_the_page_speaks_of_it(tmp_path):
@@ -503,8 +524,8 @@ def test_controls_answer_at_once_while_the_page_is_busy(page, engine):
 @pytest.mark.parametrize(
     ("label", "value", "command"),
     [
-        ("Run", "Step", m.Step()), ("Run", "Stop", m.Stop()), ("Run to frame", True, m.RunTo(0)),
-        ("Speed limit", 12, m.SpeedLimit(12.0)), ("Pause on loop closure", True, m.PauseOnLoop(True)),
+        ("Run", "Step", m.Step()), ("Run to frame", True, m.RunTo(0)),
+        ("Limit (frames/s)", 12, m.SpeedLimit(12.0)), ("Pause on loop closure", True, m.PauseOnLoop(True)),
         ("Restart", True, m.Restart("synthetic/studio", "lite", 0, "strict")),
         ("Go on with this preset", True, m.LoadPreset("lite")),
         ("Mapping iterations", 33, m.Tune("mapping.iterations", 33)),

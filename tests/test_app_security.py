@@ -186,8 +186,10 @@ def test_injected_attributes_do_nothing(open_page, engine, updates):
 @pytest.mark.parametrize(
     ("label", "value"),
     [
-        ("Speed limit", 61), ("Speed limit", -1), ("Speed limit", float("nan")), ("Speed limit", "fast"),
-        ("Speed limit", True), ("Seed", -1), ("Seed", 2**40), ("Seed", 0.5), ("Sequence", "/etc"), ("Preset", "evil"),
+        ("Limit (frames/s)", 61), ("Limit (frames/s)", -1), ("Limit (frames/s)", float("nan")),
+        ("Limit (frames/s)", "fast"),
+        ("Limit (frames/s)", True), ("Seed", -1), ("Seed", 2**40), ("Seed", 0.5), ("Sequence", "/etc"),
+        ("Preset", "evil"),
         ("Sequence", ["synthetic/studio"]), ("Run", "Quit"), ("Ground truth", "yes"), ("Voxel size (cm)", 1e300),
     ],
 )  # fmt: skip
@@ -207,9 +209,9 @@ def test_values_out_of_range_are_not_stored(open_page, engine, label, value):
 def test_honest_values_are_stored(open_page):
     with dial(open_page) as client:
         enter(client)
-        press(open_page, client, "Speed limit", 30)
+        press(open_page, client, "Limit (frames/s)", 30)
         press(open_page, client, "Preset", "full")
-        assert until(lambda: control(open_page, "Speed limit")[1].value == 30)
+        assert until(lambda: control(open_page, "Limit (frames/s)")[1].value == 30)
         assert until(lambda: control(open_page, "Preset")[1].value == "full")
 
 

@@ -1,4 +1,4 @@
-"""Steering a live run: pause, resume, step, run to, stop, start over, live parameters."""
+"""Steering a live run: pause, resume, step, run to, start over, live parameters; and stop, which asks first."""
 
 from __future__ import annotations
 
@@ -25,12 +25,19 @@ from ecslam.messages import (
 )
 from ecslam.types import InputError
 
+from .. import theme
 from ..hub import Hub
 from ..panel import BasePanel, put
 
 SCHEDULES = ("strict", "overlap")
 OVER = (State.FINISHED, State.FAILED)
-_VERBS: dict[str, Command] = {"Pause": Pause(), "Resume": Resume(), "Step": Step(), "Stop": Stop()}
+_VERBS: dict[str, Command] = {"Pause": Pause(), "Resume": Resume(), "Step": Step()}
+STOP, REALLY, CANCEL = "Stop", "Stop for good", "Cancel"
+FOR_GOOD = (
+    "Stop ends this run for good: what it has so far is finished and saved, and it cannot go on. Pause instead to look "
+    "around, or to go on later."
+)
+RESTART = "A new run in a folder of its own; ecslam resume can go on with the one that ends here"
 
 
 class Panel(BasePanel):
@@ -46,14 +53,22 @@ class Panel(BasePanel):
         super().__init__(hub)
         self._shown: tuple[Path | None, str] = None, ""
         gui = hub.server.gui
-        self._verbs = gui.add_button_group("Run", tuple(_VERBS), hint="Space pauses and resumes, n goes one step")
-        hub.commands(self._verbs, lambda: _VERBS[self._verbs.value])
+        self._ending = False
+        self._verbs = gui.add_button_group(
+            "Run",
+            (*_VERBS, STOP),
+            hint="Space pauses and resumes, n goes one step; Stop ends the run for good, and asks first",
+        )
+        self._verbs.on_click(self._steer)
+        self._warning = gui.add_html(theme.card(theme.note(FOR_GOOD, theme.BEFORE)), visible=False)
+        self._sure = gui.add_button_group("Stop?", (REALLY, CANCEL), visible=False)
+        hub.on(self._sure, lambda event: self._answer(event.target.value == REALLY, event.client))
         self._until = gui.add_number(
             "Frame", 0, min=0, max=1_000_000, step=1, hint="Go on until this frame is done, then pause"
         )
         self._run_to = gui.add_button("Run to frame", color="gray")
         hub.commands(self._run_to, lambda: RunTo(int(self._until.value)))
-        self._limit = gui.add_slider("Speed limit", 0, 60, 1, 0, hint="Frames per second at most; 0 lifts the limit")
+        self._limit = gui.add_slider("Limit (frames/s)", 0, 60, 1, 0, hint="The most the run may make; 0 is no limit")
         hub.on(self._limit, lambda event: hub.submit(SpeedLimit(float(self._limit.value)), event.client))
         self._start_over()
         self._live_parameters()
@@ -65,11 +80,37 @@ class Panel(BasePanel):
         if (self.hub.engine.run_folder, s.preset) != self._shown:
             self._show_settings(self.hub.engine.run_folder, s.preset)
         self._offer(s.state not in OVER)
+        if s.state in OVER:
+            self._ask(False)
 
     def ack(self, ack: Ack) -> None:
         """The preset that is in force already takes back what was tuned."""
         if isinstance(ack.command, LoadPreset) and not ack.error:
             self._shown = self._shown[0], ""
+
+    def begin(self) -> None:
+        """What was asked about the run before is settled."""
+        self._ending = False
+        self._ask(False)
+
+    async def _steer(self, event: Any) -> None:
+        """On the event loop, so that a verb never waits. A run that ends anyway is stopped without a question."""
+        verb, s = event.target.value, self.hub.current
+        if verb in _VERBS:
+            self.hub.submit(_VERBS[verb], event.client)
+        elif self._ending or (s is not None and s.frame + 1 >= s.frames_total):
+            self.hub.submit(Stop(), event.client)
+        else:
+            self.hub.post(lambda: self._ask(True))
+
+    def _ask(self, on: bool) -> None:
+        self._warning.visible = self._sure.visible = on
+
+    def _answer(self, really: bool, client: Any) -> None:
+        self._ask(False)
+        if really:
+            self._ending = True
+            self.hub.submit(Stop(), client)
 
     def _offer(self, steering: bool) -> None:
         """Show what steers a run as usable or not; viser cannot disable a group of buttons, so that one goes."""
@@ -94,7 +135,10 @@ class Panel(BasePanel):
                 initial_value=given.schedule,
                 hint="strict: repeatable; overlap: mapping in parallel",
             )
-            self.hub.commands(gui.add_button("Restart", color="orange"), self._restart)
+            self.hub.commands(
+                gui.add_button("Restart", color="orange", hint=RESTART),
+                self._restart,
+            )
             self._go_on = gui.add_button(
                 "Go on with this preset", color="gray", hint="Its tracking and mapping settings from here"
             )

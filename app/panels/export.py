@@ -8,13 +8,22 @@ from typing import Any
 import imageio.v3 as iio
 import viser
 
-from ecslam.messages import Export
+from ecslam.messages import Export, Snapshot
 
+from .. import theme
 from ..hub import Hub
 from ..panel import BasePanel
 from ..record import html_replay
 
 SCREENSHOT_TIMEOUT_S = 30.0
+
+
+def what_is_exported(s: Snapshot) -> str:
+    """Which frames of a replay the exports are of."""
+    return (
+        f"Mesh, poses and zip are of the whole run, frames 0 to {s.frames_total - 1}. "
+        f"Screenshot and HTML replay are of what is shown, frame {s.frame}."
+    )
 
 
 class Panel(BasePanel):
@@ -25,6 +34,7 @@ class Panel(BasePanel):
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
         gui = hub.server.gui
+        self._whole = gui.add_html("", visible=False)
         with gui.add_folder("Mesh"):
             mesh = gui.add_dropdown("Format", ("PLY", "GLB", "OBJ"))
             voxel = gui.add_slider("Voxel size (cm)", 1.0, 10.0, 0.5, 2.0, visible=hub.replay is None)
@@ -53,6 +63,12 @@ class Panel(BasePanel):
                 gui.add_button("Save screenshot", icon=viser.Icon.CAMERA, color="gray"), self._later(self._screenshot)
             )
             hub.on(gui.add_button("Save HTML replay", icon=viser.Icon.MOVIE, color="gray"), self._later(self._replay))
+
+    def snapshot(self, s: Snapshot) -> None:
+        """A replay that is not at its end exports what one does not see."""
+        if self.hub.replay is not None:
+            self._whole.content = theme.card(theme.note(what_is_exported(s), theme.KEYFRAME))
+            self._whole.visible = s.frame + 1 < s.frames_total
 
     def _later(self, job: Any) -> Any:
         """An action that runs ``job(client)`` aside and delivers the file it returns."""

@@ -29,13 +29,13 @@ class Panel(BasePanel):
         self._events: tuple[LoopEvent, ...] = ()
         self._inspected: LoopEvent | None = None
         self._chart = Chart(hub, "Rotation error (°)", markers=True)
-        self._choice = gui.add_dropdown("Loop event", (NONE,), initial_value=NONE)
+        self._choice = gui.add_dropdown("Loop event", (NONE,), initial_value=NONE, visible=False)
         hub.on(self._choice, lambda event: self._inspect(event.client))
-        steps = gui.add_button_group("Go to", ("Previous event", "Next event"))
-        hub.on(steps, lambda event: self._move(-1 if steps.value.startswith("Prev") else 1, event.client))
-        self._html = gui.add_html(_intro())
+        self._steps = gui.add_button_group("Go to", ("Previous event", "Next event"), visible=False)
+        hub.on(self._steps, lambda event: self._move(-1 if event.target.value.startswith("Prev") else 1, event.client))
+        self._html = gui.add_html(_intro(()))
         colors = [("links", theme.LOOP), ("before", theme.BEFORE), ("after", theme.ESTIMATE), ("window", theme.WINDOW)]
-        gui.add_html(theme.card(theme.legend(colors)))
+        self._legend = gui.add_html(theme.card(theme.legend(colors)), visible=False)
         if hub.replay is None:
             pause = gui.add_checkbox("Pause on loop closure", False)
             hub.on(pause, lambda event: hub.submit(PauseOnLoop(bool(pause.value)), event.client))
@@ -44,6 +44,10 @@ class Panel(BasePanel):
         names = (NONE, *map(_name, s.loops))
         if names != self._choice.options:
             self._events, self._choice.options = s.loops, names
+            for control in (self._choice, self._steps, self._legend):
+                control.visible = bool(s.loops)
+            if self._inspected is None:
+                self._html.content = _intro(s.loops)
             if self._inspected is not None and _name(self._inspected) not in names:
                 self._inspect(None)
         title, frames, values = discrepancy(s)
@@ -65,7 +69,7 @@ class Panel(BasePanel):
         event = next((e for e in self._events if _name(e) == self._choice.value), None)
         self._inspected, s = event, self.hub.current
         self.hub.scene.inspect(event, self.hub.history.window_at(event.frame) if event else ())
-        self._html.content = _intro() if event is None else _figures(event)
+        self._html.content = _intro(self._events) if event is None else _figures(event)
         if s is None:
             return
         self.hub.scene.update(s)
@@ -78,10 +82,13 @@ def _name(event: LoopEvent) -> str:
     return f"Frame {event.frame}: {event.correction_cm:.2f} cm"
 
 
-def _intro() -> str:
-    return (
-        '<div class="ec dim">When old keyframes come back into the window, the joint optimisation closes the loop. '
-        "Choose an event to see the links and the path before and after.</div>"
+def _intro(events: tuple[LoopEvent, ...]) -> str:
+    next_step = (
+        "Choose an event to see the links and the path before and after." if events else "None has closed so far."
+    )
+    return theme.card(
+        '<span class="dim">When old keyframes come back into the window, the joint optimisation closes the loop. '
+        f"{next_step}</span>"
     )
 
 

@@ -27,7 +27,7 @@ class Panel(BasePanel):
         hub.on(self._slider, lambda event: self._go_to(int(self._slider.value)))
         verbs = gui.add_button_group("Replay", tuple(_VERBS), hint="Space plays and pauses, n goes one step")
         hub.commands(verbs, lambda: _VERBS[verbs.value])
-        speed = gui.add_slider("Frames per second", 1, 60, 1, 20)
+        speed = gui.add_slider("Frames/s", 1, 60, 1, 20)
         hub.on(speed, lambda event: hub.submit(SpeedLimit(float(speed.value)), event.client))
 
     def snapshot(self, s: Snapshot) -> None:
