@@ -31,7 +31,7 @@ from ecslam.messages import (
 )
 from ecslam.runtime.protocol import EngineHandle
 
-from . import theme
+from . import hints, theme
 from .broadcast import downloading
 from .history import History, history_of, with_last_mapping
 from .panel import TABS, BasePanel, find_panels
@@ -88,6 +88,7 @@ class Hub:
             if members:
                 with group.add_tab(tab):
                     self.panels += [panel(self) for panel in members]
+        hints.tell(self.server.gui)
         self.server.on_client_connect(self._connected)
         latest = self.engine.latest()
         if latest is not None:

@@ -10,6 +10,7 @@ import viser
 from websockets.datastructures import Headers
 from websockets.http11 import Response
 
+from . import hints
 from .theme import STYLE
 
 _ICON = (
@@ -55,8 +56,8 @@ _RETURN = (
 def _page() -> tuple[bytes, bytes]:
     text = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text("utf-8")
     head = (
-        f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}</style>'
-        f"<script>{_FOCUS};{_TAP};{_RETURN}</script></head>"
+        f'<title>EC-SLAM</title><link rel="icon" href="{_ICON}"><style>{STYLE}{hints.STYLE}</style>'
+        f"<script>{_FOCUS};{_TAP};{_RETURN};{hints.SCRIPT}</script></head>"
     )
     body = text.replace("<title>Viser</title>", "").replace("</head>", head, 1).encode()
     return body, gzip.compress(body)

@@ -248,6 +248,12 @@ def test_hot_keys_work_wherever_the_focus_is_but_in_a_field(browser, tmp_path):
 
 def test_switch_preset_and_start_over(live):
     engine, visit = live
+    restart = visit.page.get_by_role("button", name="Restart", exact=True)
+    restart.hover()
+    shown = "e => getComputedStyle(e, '::after').content"
+    visit.wait(lambda: "in a folder of its own" in restart.evaluate(shown))
+    visit.page.mouse.move(300, 300)
+    visit.wait(lambda: restart.evaluate(shown) == "none")
     visit.choose("Preset", "full")
     visit.press("Restart")
     visit.wait(lambda: m.Restart("synthetic/studio", "full", 0, "strict") in engine.log)

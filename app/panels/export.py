@@ -16,6 +16,11 @@ from ..panel import BasePanel
 from ..record import html_replay
 
 SCREENSHOT_TIMEOUT_S = 30.0
+KEYFRAMES = "The poses of the keyframes alone, in TUM's format"
+ZIP = "The run's folder without its checkpoints; ecslam view opens it again"
+CONFIGURATION = "All settings in force, as YAML; --config takes them"
+SCREENSHOT = "The scene as you see it, without this panel"
+REPLAY = "A page that plays the run by itself, without anything installed"
 
 
 def what_is_exported(s: Snapshot) -> str:
@@ -48,21 +53,17 @@ class Panel(BasePanel):
                 gui.add_button("Export trajectory", icon=viser.Icon.DOWNLOAD),
                 lambda: Export("trajectory", poses.value.lower()),
             )
-            hub.commands(
-                gui.add_button("Export keyframes", icon=viser.Icon.DOWNLOAD, color="gray"), lambda: Export("keyframes")
-            )
+            hub.commands(self._button("Export keyframes", viser.Icon.DOWNLOAD, KEYFRAMES), lambda: Export("keyframes"))
         with gui.add_folder("Everything else"):
+            hub.commands(self._button("Export run as zip", viser.Icon.FILE_ZIP, ZIP), lambda: Export("run", "zip"))
             hub.commands(
-                gui.add_button("Export run as zip", icon=viser.Icon.FILE_ZIP, color="gray"),
-                lambda: Export("run", "zip"),
+                self._button("Export configuration", viser.Icon.SETTINGS, CONFIGURATION), lambda: Export("config")
             )
-            hub.commands(
-                gui.add_button("Export configuration", icon=viser.Icon.SETTINGS, color="gray"), lambda: Export("config")
-            )
-            hub.on(
-                gui.add_button("Save screenshot", icon=viser.Icon.CAMERA, color="gray"), self._later(self._screenshot)
-            )
-            hub.on(gui.add_button("Save HTML replay", icon=viser.Icon.MOVIE, color="gray"), self._later(self._replay))
+            hub.on(self._button("Save screenshot", viser.Icon.CAMERA, SCREENSHOT), self._later(self._screenshot))
+            hub.on(self._button("Save HTML replay", viser.Icon.MOVIE, REPLAY), self._later(self._replay))
+
+    def _button(self, label: str, icon: viser.IconName, hint: str) -> viser.GuiButtonHandle:
+        return self.hub.server.gui.add_button(label, icon=icon, color="gray", hint=hint)
 
     def snapshot(self, s: Snapshot) -> None:
         """A replay that is not at its end exports what one does not see."""

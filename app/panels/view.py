@@ -14,6 +14,8 @@ from ..hub import Hub
 from ..panel import BasePanel
 from ..scene import MESH_MODES
 
+FOR_ALL = "For all who look at this run"
+
 
 class Panel(BasePanel):
     """View options, shared by all viewers; the buttons move the view of who presses them."""
@@ -23,7 +25,7 @@ class Panel(BasePanel):
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
         gui = hub.server.gui
-        mode = gui.add_dropdown("Mesh", MESH_MODES)
+        mode = gui.add_dropdown("Mesh", MESH_MODES, hint=FOR_ALL)
         hub.on(mode, lambda event: self._set_mode(mode.value))
         if hub.replay is None:
             detail = gui.add_slider(
@@ -36,9 +38,9 @@ class Panel(BasePanel):
             )
             hub.on(detail, lambda event: hub.submit(RequestMesh(detail.value / 100, TRIANGLE_BUDGET), event.client))
         for label, group in (("Ground truth", "trajectory/ground truth"), ("Keyframes", "keyframes")):
-            layer = gui.add_checkbox(label, True)
+            layer = gui.add_checkbox(label, True, hint=FOR_ALL)
             hub.on(layer, partial(self._set_layer, group))
-        dark = gui.add_checkbox("Dark", hub.dark)
+        dark = gui.add_checkbox("Dark", hub.dark, hint=FOR_ALL)
         hub.on(dark, lambda event: self._set_dark(bool(dark.value)))
         follow = gui.add_button(
             "Follow camera", icon=viser.Icon.VIDEO, color="gray", hint="For you alone, until you move the view"
