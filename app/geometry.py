@@ -15,6 +15,7 @@ SAMPLE = 20_000  # faces that tell a mesh's directions
 LEVEL_DEG, LEVEL_SHARE, NEARLY_LEVEL_DEG = (40.0, 20.0, 8.0), 0.05, 2.0
 WALL = 0.2  # the most that a wall's normal may lean
 _PHONE = np.array([-0.94, 0.02]), np.array([0.94, 0.8])
+_SPARE = 0.06  # how far what was framed may grow beyond that
 
 
 def wxyz(c2w: Array) -> Array:
@@ -90,12 +91,8 @@ def seen_from(points: Array, up: Array, back: Array, aspect: float, fov_y: float
     back: direction [3] from what is seen towards the viewer, not along ``up``; aspect: width over height. On a phone
     (aspect below 0.8) the points fill the upper part, since the controls cover the rest.
     """
-    back = back / np.linalg.norm(back)
-    right = np.cross(up, back)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(back, right), back])
-    low, high = _PHONE if aspect < 0.8 else _SCREEN
-    middle, half, tangent = (high + low) / 2, (high - low) / 2, np.tan(fov_y / 2) * np.array([aspect, 1.0])
+    axes, (low, high) = _camera_axes(up, back), _part_to_fill(aspect)
+    middle, half, tangent = (high + low) / 2, (high - low) / 2, _tangent(aspect, fov_y)
     seen = points @ axes.T
     centre, distance = (seen.min(0) + seen.max(0)) / 2, 0.1
     for _ in range(4):  # nearer points take more room, so where the middle lies depends on the distance
@@ -106,6 +103,31 @@ def seen_from(points: Array, up: Array, back: Array, aspect: float, fov_y: float
         centre[:2] += (spread.min(0) + spread.max(0)) / 2 * distance
     centre[:2] -= middle * tangent * distance
     return (centre + np.array([0, 0, distance])) @ axes, centre @ axes
+
+
+def sticks_out(points: Array, up: Array, position: Array, look_at: Array, aspect: float, fov_y: float) -> bool:
+    """Whether any of ``points`` [n, 3] lies clearly outside what ``seen_from`` fills, for a view that it has given."""
+    local = (points - position) @ _camera_axes(up, position - look_at).T
+    low, high = _part_to_fill(aspect)
+    seen = local[:, :2] / -local[:, 2:].clip(max=-1e-3) / _tangent(aspect, fov_y)
+    return bool(((seen < low - _SPARE) | (seen > high + _SPARE)).any() or local[:, 2].max() > 0)
+
+
+def _camera_axes(up: Array, back: Array) -> Array:
+    """To the right, up and back [3, 3] of a camera that looks against ``back``, as rows."""
+    back = back / np.linalg.norm(back)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back])
+
+
+def _part_to_fill(aspect: float) -> tuple[Array, Array]:
+    return _PHONE if aspect < 0.8 else _SCREEN
+
+
+def _tangent(aspect: float, fov_y: float) -> Array:
+    """Half the width and half the height [2] of the picture, one unit before the camera."""
+    return np.asarray(np.tan(fov_y / 2) * np.array([aspect, 1.0]))
 
 
 def first_side(c2w: Array, up: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from .geometry import behind, distance_to_path, overview, seen_from, square_side
+from .geometry import behind, distance_to_path, overview, seen_from, square_side, sticks_out
 from .grids import WallGrids
 from .scene import Scene
 
@@ -20,7 +20,7 @@ STRAIGHT_FOV_RAD = np.radians(8.0)  # seen from far away, what is parallel stays
 LEAN = 0.002  # off the plumb line, where a camera would not know how to turn
 GLIDE_S, GLIDE_STEPS_PER_S = 0.6, 30
 GLIDERS = 4  # with more viewers each one's camera jumps: thirty messages a second to each would cost the engine
-MOVED, WORTH_A_MOVE = 0.02, 0.12
+MOVED, A_LITTLE, WORTH_A_MOVE = 0.02, 0.01, 0.12  # of the distance to what one looks at
 REMEMBERED, REMEMBERED_BEHIND = 8, 40
 
 
@@ -83,7 +83,7 @@ class Views:
                 continue
             position, look_at = self._all(client)
             away = max(np.linalg.norm(position - framing.position), np.linalg.norm(look_at - framing.look_at))
-            if away > WORTH_A_MOVE * distance:
+            if away > (A_LITTLE if self._outgrown(client, framing) else WORTH_A_MOVE) * distance:
                 self.show_all(client, 2 * GLIDE_S if len(clients) <= GLIDERS else 0.0)
 
     def reshaped(self, client: viser.ClientHandle) -> None:
@@ -134,6 +134,10 @@ class Views:
             framing = self._framed.get(client.client_id)
             if framing is not None and framing.follows and not framing.left(client):
                 self.follow(client, c2w)
+
+    def _outgrown(self, client: viser.ClientHandle, framing: _Framing) -> bool:
+        place, aspect = (framing.position, framing.look_at), client.camera.aspect or 1.5
+        return sticks_out(self._scene.points, self._scene.up, *place, aspect, FOV_RAD)
 
     def _way(self, client: viser.ClientHandle, position: Array, most: int) -> Array:
         """The last places [k, 3] that the page has put a viewer at, then where it is and where it goes."""

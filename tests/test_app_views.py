@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ecslam_app import server, views
-from ecslam_app.geometry import behind, square_side
+from ecslam_app.geometry import behind, overview, square_side, sticks_out
 
 from ecslam.types import Mesh
 from tests.fake_engine import FakeEngine, room_mesh
@@ -65,6 +65,26 @@ def test_a_little_growth_moves_nobody(page, viewer):
     before = np.array(client.camera.position)
     grow(page, 1.02)
     assert np.array_equal(client.camera.position, before)
+
+
+def test_what_sticks_out_of_the_picture_is_brought_back_into_it(page, viewer):
+    _, client = viewer
+    before = np.array(client.camera.position)
+    page.hub.scene.points = 1.1 * BOX
+    place = page.hub.views._all(client)
+    assert np.linalg.norm(place[0] - before) < views.WORTH_A_MOVE * np.linalg.norm(before)
+    grow(page, 1.1)
+    assert until(lambda: np.allclose(client.camera.position, place[0]))
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.4])
+def test_only_what_clearly_sticks_out_of_a_framed_view_is_outside(aspect):
+    up = np.array([0.0, 0, 1])
+    place = overview(BOX, up, np.array([0.8, -0.6, 0]), aspect, views.FOV_RAD)
+    assert not sticks_out(1.02 * BOX, up, *place, aspect, views.FOV_RAD)
+    assert sticks_out(1.2 * BOX, up, *place, aspect, views.FOV_RAD)
+    behind_camera = place[0] + 0.1 * (place[0] - place[1])
+    assert sticks_out(behind_camera[None], up, *place, aspect, views.FOV_RAD)
 
 
 def test_who_has_moved_the_camera_keeps_it(page, viewer):
