@@ -510,6 +510,24 @@ def test_state_is_told_in_plain_words(engine, state):
     assert "1 of 60" in html
 
 
+@pytest.mark.parametrize(
+    ("skipped", "lost", "says"), [(3, 0, "3 frames skipped<"), (0, 1, ">1 frame lost"), (1, 2, "1 frame skipped, 2 fr")]
+)
+def test_only_frames_that_were_missed_are_counted(engine, skipped, lost, says):
+    html = render(replace(engine.snapshot(), skipped=skipped, lost_frames=lost), "")
+    assert says in html
+    assert "0 frames" not in html
+
+
+def test_a_replay_plays_and_does_not_track(replay_page):
+    status = next(p for p in replay_page.hub.panels if isinstance(p, Status))
+    replay_page.engine.submit(m.SpeedLimit(1.0))
+    for command, says in ((m.RunTo(29), "At the end"), (m.RunTo(3), "Paused"), (m.Resume(), "Playing")):
+        replay_page.engine.submit(command)
+        assert until(lambda says=says: says in status._html.content)
+    replay_page.engine.submit(m.Pause())
+
+
 def test_controls_answer_at_once_while_the_page_is_busy(page, engine):
     engine.start()
     with dial(page) as client:

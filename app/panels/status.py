@@ -21,6 +21,7 @@ WORDS = {
     State.FINISHED: "Finished",
     State.FAILED: "Failed",
 }
+_REPLAYED = {State.TRACKING: "Playing", State.FINISHED: "At the end"}
 _LINES = {
     "estimate": theme.ESTIMATE,
     "ground truth": theme.TRUTH,
@@ -53,7 +54,8 @@ class Panel(BasePanel):
     def snapshot(self, s: Snapshot) -> None:
         if s.state in _SETTLED:
             self._halting = None
-        self._html.content = render(s, _COMING[type(self._halting)] if self._halting else "")
+        replayed = _REPLAYED.get(s.state, "") if self.hub.replay is not None else ""
+        self._html.content = render(s, _COMING[type(self._halting)] if self._halting else replayed)
 
     def ack(self, ack: Ack) -> None:
         """Answer at once; a halt that waits for the frame at work keeps its word until it has come about. A replay has
@@ -68,7 +70,7 @@ class Panel(BasePanel):
 
 
 def render(s: Snapshot | None, coming: str) -> str:
-    """The status card as HTML; ``coming`` replaces the state while a command is being carried out."""
+    """The status card as HTML; ``coming`` replaces the state while a command is being carried out, and in a replay."""
     if s is None:
         waiting = theme.chip("Waiting for the first frame", theme.KEYFRAME)
         return f'<div class="ec"><div class="ec-head">{waiting}</div></div>'
@@ -88,8 +90,9 @@ def render(s: Snapshot | None, coming: str) -> str:
     lines = [line for line in _LINES.items() if line[0] != "ground truth" or s.trajectory_gt is not None]
     name = f"{escape(s.sequence)} · {escape(s.preset)}"
     notes = [theme.note(s.reason, color)] if s.reason else []
-    if s.skipped or s.lost_frames:
-        notes.append(theme.note(f"{s.skipped} frames skipped, {s.lost_frames} frames lost", theme.ESTIMATE))
+    missed = [_count(n, what) for n, what in ((s.skipped, "skipped"), (s.lost_frames, "lost")) if n]
+    if missed:
+        notes.append(theme.note(", ".join(missed), theme.ESTIMATE))
     return (
         f'<div class="ec"><div class="ec-head">{theme.chip(coming or WORDS[s.state], color)}'
         f'<span class="ec-name dim" title="{name}">{name}</span></div>'
@@ -97,3 +100,7 @@ def render(s: Snapshot | None, coming: str) -> str:
         f'{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
         f'<div class="ec-grid">{"".join(cells)}</div>{theme.legend(lines)}{"".join(notes)}</div>'
     )
+
+
+def _count(frames: int, what: str) -> str:
+    return f"{frames} frame{'s' * (frames > 1)} {what}"
