@@ -27,12 +27,14 @@ _POLICY = (
 )
 # A control that was clicked keeps the focus, and would take the next key for its own: let go of it. One that the
 # keyboard has reached keeps the keys it needs: space presses a button or ticks a box, and is no hot key then. A tab
-# needs none but the arrows and Enter; all others are hot keys, as everywhere but in a field that one types in.
+# needs none but the arrows and Enter; all others are hot keys, as everywhere but in a field that one types in. Enter
+# ends the typing of a number.
 _FOCUS = (
-    "addEventListener('click',e=>{if(e.detail&&e.target.closest('button,label,[role=tab],[role=option],"
-    "[type=checkbox]'))setTimeout(()=>document.activeElement.blur())});"
+    "addEventListener('click',e=>{const chosen=e.target.closest('[role=option]');if(e.detail)setTimeout(()=>{const "
+    "on=document.activeElement;if(chosen||on.matches('button,[role=tab],[type=checkbox]'))on.blur()})});"
     "addEventListener('keydown',e=>{if(e.ctrlKey||e.metaKey||e.altKey)return;const space=e.key===' ',"
     "on=kind=>e.target.closest(kind);if(space&&on('button'))e.stopPropagation();"
+    "else if(e.key==='Enter'&&on('[inputmode]'))setTimeout(()=>e.target.blur());"
     "else if(space?on('[role=tab]'):e.key.length===1&&on('[type=checkbox]')){e.preventDefault();e.stopPropagation();"
     "document.body.dispatchEvent(new KeyboardEvent('keydown',e))}},true)"
 )

@@ -223,6 +223,7 @@ def test_hot_keys_work_wherever_the_focus_is_but_in_a_field(browser, tmp_path):
             lambda: visit.tab("Plots"),
             lambda: page.get_by_role("tab", name="Run").focus(),
             lambda: (visit.tab("View"), visit.tick("Keyframes")),
+            lambda: [page.locator("label", has_text="Keyframes").click() for _ in range(2)],
             lambda: visit.choose("Mesh", "Normals"),
         ):
             act()
@@ -240,6 +241,9 @@ def test_hot_keys_work_wherever_the_focus_is_but_in_a_field(browser, tmp_path):
             page.keyboard.press(key)
         page.wait_for_timeout(1000)
         assert visit.frame == 21
+        page.keyboard.press("Enter")
+        page.keyboard.press("n")
+        visit.wait(lambda: visit.frame == 22)
     finally:
         page.close()
         dashboard.close()

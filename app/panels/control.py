@@ -60,8 +60,8 @@ class Panel(BasePanel):
             hint="Space pauses and resumes, n goes one step; Stop ends the run for good, and asks first",
         )
         self._verbs.on_click(self._steer)
-        self._warning = gui.add_html(theme.card(theme.note(FOR_GOOD, theme.BEFORE)), visible=False)
         self._sure = gui.add_button_group("Stop?", (REALLY, CANCEL), visible=False)
+        self._warning = gui.add_html(theme.card(theme.note(FOR_GOOD, theme.BEFORE)), visible=False)
         hub.on(self._sure, lambda event: self._answer(event.target.value == REALLY, event.client))
         self._until = gui.add_number(
             "Frame", 0, min=0, max=1_000_000, step=1, hint="Go on until this frame is done, then pause"
