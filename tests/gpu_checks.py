@@ -27,6 +27,7 @@ from on_gpu import DEVICE, INTERPRETED, moved, run
 
 from ecslam.config import FieldConfig
 from ecslam.field import grow_field
+from ecslam.field_adam import FieldAdam
 from ecslam.kernels import FieldParams, PoseMoments, gpu, reference
 from ecslam.kernels.poses_gpu import pose_step
 from ecslam.pose_adam import BETA2, EPSILON, PoseAdam
@@ -213,6 +214,18 @@ def test_no_step_waits_for_the_gpu(monkeypatch, want_params, want_poses):
     with Forbidding():
         found = gpu.step(field.layout, params, c2w, rays, WEIGHTS, mine, want_poses)
     assert found.losses.device.type == "meta"
+
+
+def test_a_step_that_learns_moves_the_table_as_its_gradient_says():
+    field, (c2w, rays) = moved(make_field(), DEVICE), (moved(part, DEVICE) for part in make_rays(20, 4))
+    start, mine = field.params.table.clone(), blank(field.params)
+    adam = FieldAdam([field.params.table])
+    gpu.step(field.layout, field.params, c2w, rays, WEIGHTS, mine, False, adam.steps(1e-2, 0)[0])
+    expected, alone = start.clone(), FieldAdam([start])
+    reference.map_step([expected], [mine.table], alone.steps(1e-2, 0)[0])
+    assert (mine.table != 0).any()
+    assert torch.equal(field.params.table, expected)
+    assert torch.equal(adam.mean[0], alone.mean[0])
 
 
 @pytest.mark.parametrize("poses", [1, 5, 33])
