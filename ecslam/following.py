@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -32,6 +32,15 @@ if TYPE_CHECKING:
 
 GAP_S = 1.0
 SWEEP_OVER = 2  # frames: with fewer, what one is off by moves the next
+
+
+class Expected(NamedTuple):
+    """Where a frame is looked for. c2w: [4, 4]. known: whether the frames before tell; else it is where the last one
+    was. gap: whether too much time has passed since that one."""
+
+    c2w: NDArray[np.float64]
+    known: bool
+    gap: bool
 
 
 class Follower:
@@ -68,34 +77,41 @@ class Follower:
         assert not isinstance(self._volume, FusedVolume | None)
         return GpuTracker(self._camera, self._volume, observed, self._kernels, generator, self.recorder)
 
-    def still(self, frame: Frame, trajectory: Trajectory, config: Config) -> Frame:
-        """The frame after ``trajectory`` without what moves by itself, where it is known what was there before."""
-        if config.movers or self.recovery.lost or self._after_gap(frame, trajectory):
+    def expected(self, frame: Frame, trajectory: Trajectory) -> Expected:
+        """Where the frame after ``trajectory`` is likely to have been seen from, at constant velocity."""
+        gap = frame.timestamp - trajectory.timestamps[-1] > GAP_S
+        known = not (gap or self.recovery.lost)
+        return Expected(trajectory.predict(frame.timestamp) if known else trajectory[-1], known, gap)
+
+    def still(self, frame: Frame, expected: Expected, trajectory: Trajectory, config: Config) -> Frame:
+        """The frame without what moves by itself, where it is known what was there before."""
+        if config.movers or not expected.known:
             return frame
-        return self._movers.without(frame, trajectory.predict(frame.timestamp), trajectory.keyframe_poses())
+        return self._movers.without(frame, expected.c2w, trajectory.keyframe_poses())
 
     def remember(self, frame: Frame, keyframe: int) -> None:
         """Keep what a frame saw that became the keyframe number ``keyframe``: what is new there later has come."""
         self._movers.remember(frame, keyframe)
 
     def follow(
-        self, frame: Frame, trajectory: Trajectory, keyframes: list[Keyframe], field: TsdfField, config: Config
+        self,
+        frame: Frame,
+        expected: Expected,
+        trajectory: Trajectory,
+        keyframes: list[Keyframe],
+        field: TsdfField,
+        config: Config,
     ) -> TrackResult:
-        """The pose of the frame after ``trajectory``: a constant-velocity start, the preset's tracker on ``field``, and
-        recovery when the map does not explain the frame, which then says whether it is only the last pose again."""
+        """The pose of the frame after ``trajectory``: the preset's tracker on ``field``, starting where it is expected,
+        and recovery when the map does not explain the frame, which then says whether it is only the last pose again."""
         if config.tracking.iterations > 0 or self._volume is None:
             self._observe(trajectory, keyframes)
         surface, tracker = self._tracker(field, config)
-        last, gap = trajectory[-1], self._after_gap(frame, trajectory)
-        guess = last if self.recovery.lost or gap else trajectory.predict(frame.timestamp)
-        sweep = STILL if self.recovery.lost or gap else self.sweep(trajectory, config)
-        starts = around(guess) if gap else [guess]
+        sweep = self.sweep(trajectory, config) if expected.known else STILL
+        starts = around(expected.c2w) if expected.gap else [expected.c2w]
         track = best_start(lambda start: tracker.track(frame, start, field, config, sweep), starts)
         elsewhere = Relocalisation(frame, self._camera, surface, trajectory, keyframes, config, self._rng)
-        return self.recovery.judge(track, last, elsewhere, gap)
-
-    def _after_gap(self, frame: Frame, trajectory: Trajectory) -> bool:
-        return frame.timestamp - trajectory.timestamps[-1] > GAP_S
+        return self.recovery.judge(track, trajectory[-1], elsewhere, expected.gap)
 
     def sweep(self, trajectory: Trajectory, config: Config) -> Sweep:
         """How the camera moves while an image is read, if it moves as in the last frames of ``trajectory`` (see

@@ -107,11 +107,13 @@ class Slam:
             return self._first_frame(frame, interrupt)
         started = time.perf_counter()
         self._apply_pending(block=False)
-        seen, frame = frame, self._follower.still(frame, self.trajectory, self.config)
+        expected = self._follower.expected(frame, self.trajectory)
+        seen, frame = frame, self._follower.still(frame, expected, self.trajectory, self.config)
         if frame is not seen and not self._moving:
             self._note = MOVING
         self._moving = frame is not seen
-        track = self._follower.follow(frame, self.trajectory, self.keyframes, self._require_field(), self.config)
+        given = self.trajectory, self.keyframes, self._require_field(), self.config
+        track = self._follower.follow(frame, expected, *given)
         index, recovery = len(self.trajectory), self._follower.recovery
         keyframe = index % self.config.keyframe_every == 0 and not recovery.missed
         self.trajectory.append(track.c2w, frame.timestamp, keyframe)
