@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ecslam.datasets import open_sequence
 from ecslam.datasets.agreement import odd_truth
@@ -42,6 +43,14 @@ def millimetres() -> np.ndarray:
     return poses
 
 
+def other_quaternions() -> np.ndarray:
+    """Written as w x y z, read as x y z w."""
+    poses = ROOM.poses_gt().copy()
+    wxyz = np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1)
+    poses[:, :3, :3] = Rotation.from_quat(wxyz).as_matrix()
+    return poses
+
+
 @pytest.mark.parametrize(
     ("says", "room"),
     [
@@ -49,6 +58,7 @@ def millimetres() -> np.ndarray:
         ("OpenGL's", Spoilt(ROOM.poses_gt() @ OPENGL)),
         ("OpenGL's views", Spoilt(np.linalg.inv(ROOM.poses_gt() @ OPENGL))),
         ("millimetres", Spoilt(millimetres())),
+        ("qw qx qy qz", Spoilt(other_quaternions())),
         ("5 times as much", Spoilt(ROOM.poses_gt(), 0.2)),
         ("a fifth", Spoilt(ROOM.poses_gt(), 5.0)),
         ("wrong poses", Spoilt(ROOM.poses_gt() @ TURNED)),

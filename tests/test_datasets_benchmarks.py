@@ -152,7 +152,7 @@ def test_frames_have_the_times_of_depth_in_a_list_of_pairs(tmp_path: Path, room:
     [
         ("", "lists nothing"),
         ("0 rgb/0.png 0", "line 1 has 3 of 4"),
-        ("a rgb/0.png a depth/0.png", "not a number"),
+        ("a rgb/0.png a depth/0.png", "where a number is due"),
         ("0 rgb/0.png nan depth/0.png", "not finite"),
         ("0 rgb/0.png 0 depth/77.png", "missing"),
     ],

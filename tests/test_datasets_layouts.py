@@ -347,7 +347,7 @@ def test_colour_and_depth_that_cannot_match_are_refused(folder: Path) -> None:
         ("nothing-here", "no such folder"),
         ("empty", "empty folder"),
         ("file.txt", "give the folder"),
-        ("unknown", "no known layout"),
+        ("unknown/sub/deep", "no known layout"),
         ("unknown/above", "did you mean"),
         ("a\0b", "not a path"),
         ("x" * 5000, "cannot be opened"),
@@ -356,7 +356,7 @@ def test_colour_and_depth_that_cannot_match_are_refused(folder: Path) -> None:
 def test_what_cannot_be_opened_is_said_in_one_line(tmp_path: Path, address: str, says: str) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "file.txt").write_text("x")
-    (tmp_path / "unknown/sub").mkdir(parents=True)
+    (tmp_path / "unknown/sub/deep/er").mkdir(parents=True)
     write_vmap(tmp_path / "unknown/above/room")
     with pytest.raises(InputError, match=says) as caught:
         open_sequence(f"{tmp_path}/{address}")
@@ -759,7 +759,7 @@ def test_tum_with_odd_times_opens_and_says_so(tmp_path: Path) -> None:
     [
         ("rgb.txt", "# nothing\n", "lists nothing"),
         ("rgb.txt", "1.0\n", "line 1 has 1 of 2 fields"),
-        ("depth.txt", "soon depth/0.png\n", "not a number"),
+        ("depth.txt", "soon depth/0.png\n", "where a number is due"),
         ("depth.txt", "nan depth/0.png\n", "not finite"),
         ("depth.txt", "5.0 depth/0.png\n", "within 20 ms"),
         ("rgb.txt", "1305031102.0 rgb/none.png\n", "missing"),

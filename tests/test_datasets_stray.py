@@ -181,7 +181,7 @@ def test_frames_read_ahead_are_those_read_one_by_one(tmp_path: Path) -> None:
         ("odometry.csv", b"", "names no timestamp"),
         ("odometry.csv", b"timestamp, frame, x, y, z\n1, 0, 0, 0, 0", "names no qx, qy, qz, qw"),
         ("odometry.csv", b"timestamp, frame, x, y, z, qx, qy, qz, qw\n", "no line has a time"),
-        ("odometry.csv", b"\xff\xfe\xff", "not a text file"),
+        ("odometry.csv", b"\xff\xfe\xff", "not text in UTF-8"),
     ],
 )
 def test_files_that_cannot_be_used_are_refused(tmp_path: Path, name: str, data: bytes, says: str) -> None:

@@ -23,19 +23,33 @@ Poses = NDArray[np.float64]
 
 class Reading(NamedTuple):
     """A way to read the files. meaning: completes "by so much less if". stretch: what the camera's steps are multiplied
-    by."""
+    by. w_first: quaternions that were taken for x y z w are w x y z."""
 
     meaning: str
     inverted: bool = False
     axes: Poses = np.eye(4)
     stretch: float = 1.0
+    w_first: bool = False
 
     def move(self, poses: Poses) -> Poses:
         """From the camera of the first of two poses [2, 4, 4] to that of the second, [4, 4]."""
+        if self.w_first:
+            poses = _reordered(poses)
         first, second = (np.linalg.inv(poses) if self.inverted else poses) @ self.axes
         out: Poses = np.linalg.inv(second) @ first
         out[:3, 3] *= self.stretch
         return out
+
+
+def _reordered(poses: Poses) -> Poses:
+    """Poses [N, 4, 4] with the rotations that their quaternions are in the order w x y z."""
+    from scipy.spatial.transform import Rotation
+
+    out = poses.copy()
+    out[:, :3, :3] = Rotation.from_quat(
+        np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), -1, axis=1)
+    ).as_matrix()
+    return out
 
 
 AS_IT_IS = Reading("")
@@ -44,6 +58,7 @@ OTHERS = (
     Reading("y and z axes of the poses were negated, for they seem to be OpenGL's", axes=OPENGL),
     Reading("poses were inverted, then y and z axes negated, for they seem to be OpenGL's views", True, OPENGL),
     Reading("poses were in metres, for they seem to be in millimetres", stretch=1e-3),
+    Reading("quaternions were qw qx qy qz, for they seem not to be qx qy qz qw", w_first=True),
     Reading("depth were 5 times as much: a wrong depth scale", stretch=0.2),
     Reading("depth were a fifth: a wrong depth scale", stretch=5.0),
 )

@@ -120,7 +120,7 @@ def _decode_grey(place: Path | str, data: bytes, size: tuple[int, int], what: st
     if (header.kind, header.bits, header.channels) != ("PNG", bits, 1):
         found = f"{header.bits}-bit {header.kind} with {header.channels} channels"
         raise FrameError(
-            f"{place}: a {found}, but {what} must be a {bits}-bit PNG with one; export it again without conversion"
+            f"{place}: {found}, but {what} must be a {bits}-bit PNG with one; export it again without conversion"
         )
     return _decode(place, data, cv2.IMREAD_UNCHANGED, (size[1], size[0]), kind)
 
@@ -168,7 +168,7 @@ def parse_header(place: Path | str, data: bytes) -> ImageHeader:
     elif data.startswith(JPEG_SIGNATURE):
         header = _jpeg_header(data)
     else:
-        raise FrameError(f"{place}: neither PNG nor JPEG; convert it to one of them")
+        raise FrameError(f"{place}: neither PNG nor JPEG; convert it to one of them, depth to 16-bit PNG")
     if header is None or header.width < 1 or header.height < 1:
         raise FrameError(f"{place}: damaged or truncated header; copy it again")
     return header

@@ -25,7 +25,7 @@ from .reading import (
     same_shape,
 )
 
-COLOR = r"img(\d{1,9})\.(?:png|jpg)"
+COLOR = r"img(\d{1,9})\.(?:png|jpe?g)"
 DEPTH_FOLDERS = ("depth_filtered", "depth_with_noise", "depth")
 FRAMES_PER_S = 30.0
 
@@ -66,5 +66,7 @@ def open(path: Path) -> FileSequence:
 def _camera(file: Path, size: tuple[int, int]) -> Intrinsics:
     focal = read_numbers(file)
     if focal.size != 1 or not np.isfinite(focal).all():
-        raise InputError(f"{file}: {focal.size} numbers, but it takes one, the focal length in pixels of depth")
+        raise InputError(
+            f"{file}: holds {' '.join(map(str, focal[:4]))}; it takes one number, the focal length in pixels of depth"
+        )
     return Intrinsics(focal.item(), focal.item(), (size[0] - 1) / 2, (size[1] - 1) / 2, *size)

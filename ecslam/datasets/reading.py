@@ -24,8 +24,8 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from its camera axes to OpenCV's, or
 
 
 def numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """Files of ``folder`` whose whole name matches ``pattern``, by the number in its first group, ascending."""
-    regex = re.compile(pattern)
+    """Files of ``folder`` whose name as a whole matches ``pattern``, in any case; by the number in its first group."""
+    regex = re.compile(pattern, re.IGNORECASE)
     if not folder.is_dir():
         return {}
     matches = ((regex.fullmatch(path.name), path) for path in sorted(folder.iterdir()))
@@ -34,8 +34,8 @@ def numbered(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def has_numbered(folder: Path, pattern: str) -> bool:
-    """Whether any file name in ``folder`` matches ``pattern`` as a whole."""
-    return folder.is_dir() and any(re.fullmatch(pattern, path.name) for path in folder.iterdir())
+    """Whether any file name in ``folder`` matches ``pattern`` as a whole, in any case."""
+    return folder.is_dir() and any(re.fullmatch(pattern, path.name, re.IGNORECASE) for path in folder.iterdir())
 
 
 def paired(color: dict[int, Path], depth: dict[int, Path], folder: Path) -> list[int]:
@@ -59,15 +59,17 @@ def read_text(path: Path) -> str:
             raise InputError(f"{path}: over {MAX_TEXT_BYTES >> 20} MiB of text; is it the right file?")
         return path.read_text("utf-8-sig")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror}); put a readable one there") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file") from None
+        raise InputError(f"{path}: not text in UTF-8; save it as that") from None
 
 
 def read_numbers(path: Path) -> NDArray[np.float64]:
-    """All numbers of a text file, flat; ``inf`` and ``nan`` are allowed, also as ``-nan(ind)``. Raises InputError."""
+    """All numbers of a text file, flat, without comments (``#``); ``inf`` and ``nan`` are allowed, also as
+    ``-nan(ind)``. Raises InputError."""
+    text = re.sub("#.*", "", read_text(path))
     try:
-        return np.array(read_text(path).replace(",", " ").replace("(ind)", "").split(), np.float64)
+        return np.array(text.replace(",", " ").replace("(ind)", "").split(), np.float64)
     except ValueError:
         raise InputError(f"{path}: holds something that is not a number; write plain numbers") from None
 
@@ -190,7 +192,7 @@ def rigid(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, .
     good &= np.abs(safe[:, 3] - [0, 0, 0, 1]).max(1) < 1e-6
     bad = int((~good).sum())
     notes = (
-        (f"{bad} of {len(poses)} ground-truth poses are missing, infinite or not rigid and are left out",)
+        (f"{bad} of {len(poses)} ground-truth poses are missing, infinite or no rigid 4x4 matrix and are left out",)
         if bad
         else ()
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -19,6 +20,8 @@ from .views import with_readout
 
 SYNTHETIC = "synthetic/"
 READOUT, MOST_READOUT_S = "readout", 0.1
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
+MOST_TRIED = 100
 
 
 class Layout(Protocol):
@@ -121,19 +124,36 @@ def _read_readout(path: Path, given: str) -> float:
 
 
 def _why_unknown(path: Path) -> str:
+    above = _layout_of(path.parent)
+    around = f"{path}: not a sequence itself; did you mean {path.parent}?" if above and not suffixes_of(above) else ""
     if not path.is_dir():
-        return (
-            f"{path}: a file, and not one of {', '.join(sorted(suffixes()))}; give the folder that holds the sequence"
-        )
+        if path.name.lower().endswith(ARCHIVES):
+            return f"{path}: packed; unpack it and give the folder that holds the sequence"
+        kinds = ", ".join(sorted(suffixes()))
+        return around or f"{path}: a file, and not one of {kinds}; give the folder that holds the sequence"
     names = sorted(p.name for p in path.iterdir())
     if not names:
         return f"{path}: an empty folder; give a folder that holds a sequence"
-    inside = next((p for p in sorted(path.iterdir())[:100] if looks_like_one(p)), None)
+    inside = next((p for p in _within(path) if looks_like_one(p)), None)
     if inside is not None:
         return f"{path}: not a sequence itself; did you mean {inside}?"
+    if around:
+        return around
+    packed = next((name for name in names if name.lower().endswith(ARCHIVES)), None)
+    if packed is not None:
+        return f"{path}: no sequence, but {packed}; unpack that"
     found = ", ".join(names[:4]) + (" ..." if len(names) > 4 else "")
     known = "; ".join(summary(layout) for layout in layouts())
     return f"{path}: no known layout (it holds {found}); rearrange it as one of these: {known}"
+
+
+def _within(path: Path) -> Iterator[Path]:
+    """What lies in a folder, then what lies in its folders, as far as that can be read; the first hundred of each."""
+    inside = sorted(path.iterdir())[:MOST_TRIED]
+    yield from inside
+    for each in inside:
+        if each.is_dir() and os.access(each, os.R_OK | os.X_OK):
+            yield from sorted(each.iterdir())[:MOST_TRIED]
 
 
 def suffixes() -> frozenset[str]:
@@ -148,10 +168,14 @@ def suffixes_of(layout: Layout) -> tuple[str, ...]:
 
 def looks_like_one(path: Path) -> bool:
     """Whether ``path`` seems to be a sequence, by file names alone; not where those cannot be read."""
+    return _layout_of(path) is not None
+
+
+def _layout_of(path: Path) -> Layout | None:
     try:
-        return _recognise(path) is not None
+        return _recognise(path)
     except OSError:
-        return False
+        return None
 
 
 def _recognise(path: Path) -> Layout | None:

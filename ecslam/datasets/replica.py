@@ -12,7 +12,7 @@ from .files import FileSequence
 from .meshes import first_existing
 from .reading import has_numbered, numbered, paired, read_pose_list, read_text, same_size
 
-COLOR = r"frame(\d{1,9})\.(?:jpg|png)"
+COLOR = r"frame(\d{1,9})\.(?:jpe?g|png)"
 CAMERA = Intrinsics(600.0, 600.0, 599.5, 339.5, 1200, 680)
 DEPTH_SCALE = 6553.5
 FRAMES_PER_S = 30.0

@@ -29,7 +29,7 @@ OPTIONS = ("color", "depth")
 
 def sniff(path: Path) -> bool:
     """Whether it is a file that ROS records, or a folder with metadata.yaml and such files."""
-    if path.suffix in SUFFIXES and path.is_file():
+    if path.suffix.lower() in SUFFIXES and path.is_file():
         return True
     return (path / "metadata.yaml").is_file() and any(_is_part(each.name) for each in path.iterdir())
 
@@ -98,7 +98,7 @@ def open(path: Path, color: str = "", depth: str = "") -> RosRecording:
 
 
 def _is_part(name: str) -> bool:
-    return name.removesuffix(".zstd").endswith((".mcap", ".db3"))
+    return name[0] != "." and name.lower().removesuffix(".zstd").endswith((".mcap", ".db3"))
 
 
 def _parts(path: Path) -> list[Path]:

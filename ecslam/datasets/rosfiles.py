@@ -59,7 +59,7 @@ class Reader:
             raise FrameError(f"{place.file}: {error}; copy or record it again") from None
 
     def _stored(self, place: Place) -> bytes:
-        if place.file.suffix == ".db3":
+        if place.file.suffix.lower() == ".db3":
             return _row(place)
         if place.chunk is not None:
             return self._chunk(place.file, place.chunk)[place.at : place.at + place.size]

@@ -56,7 +56,7 @@ def find_messages(files: list[Path], wanted: Wanted) -> Index:
     index = Index()
     walks = {".bag": _BagWalk, ".mcap": _McapWalk, ".db3": _SqliteWalk}
     for file in files:
-        walk = walks[file.suffix](file, index, wanted)
+        walk = walks[file.suffix.lower()](file, index, wanted)
         try:
             with closing(walk):
                 walk.run()

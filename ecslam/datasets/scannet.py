@@ -10,7 +10,7 @@ from .files import FileSequence
 from .meshes import first_existing
 from .reading import common_size, has_numbered, numbered, paired, read_intrinsics, read_pose_files, same_shape
 
-COLOR = r"(\d{1,9})\.(?:jpg|png)"
+COLOR = r"(\d{1,9})\.(?:jpe?g|png)"
 FRAMES_PER_S = 30.0
 
 

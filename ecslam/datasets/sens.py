@@ -123,7 +123,7 @@ def open(path: Path) -> SensorStream:
 
 
 def _streams(folder: Path) -> list[Path]:
-    return [each for each in folder.iterdir() if _is_stream(each)]
+    return [each for each in folder.iterdir() if _is_stream(each) and each.name[0] != "."]
 
 
 def _is_stream(path: Path) -> bool:

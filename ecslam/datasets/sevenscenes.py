@@ -28,7 +28,7 @@ from .reading import (
 )
 from .registration import Registration
 
-COLOR = r"frame-(\d{1,9})\.color\.(?:jpg|png)"
+COLOR = r"frame-(\d{1,9})\.color\.(?:jpe?g|png)"
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0, 640, 480, readout_s=KINECT_READOUT_S)
 KINECT_COLOR, KINECT_BASELINE_M = Intrinsics(525.0, 525.0, 320.0, 240.0, 640, 480), 0.025  # redkitchen fits these best
 INFO, INFO_KEY = ("info.txt", "_info.txt"), "m_calibrationDepthIntrinsic"

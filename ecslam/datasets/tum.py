@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 from ..types import InputError, Intrinsics
 from .benchmarks import ICL_TRUTH, KINECT_READOUT_S, Benchmark, benchmark
 from .files import FileSequence
+from .listing import listed_file, read_rows, to_numbers, to_times
 from .meshes import first_existing
 from .reading import INTRINSICS_FILE, find_intrinsics, read_numbers, read_text, same_size
+from .views import in_order
 
 MAX_DIFFERENCE_S = 0.02
 DEPTH_SCALE = 5000.0
+MOST_IN_DISORDER = 0.05  # of the listed images; beyond, the order of a list means nothing
 MOST_MISSING = 0.05  # of the listed images; each of Bonn's recordings lacks some
 ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "associate.txt")
 CALIBRATION = "calibration.txt"
@@ -50,7 +53,7 @@ def open(path: Path) -> FileSequence:
     decides the pose: on freiburg1_xyz ground truth at the times of the depth images makes surfaces of different frames
     fit to 14 mm, at those of the colour images (12 ms later) to 21 mm.
     """
-    images = _from_lists(path) if _has_lists(path) else _from_associations(path)
+    images = _by_time(_from_lists(path) if _has_lists(path) else _from_associations(path))
     size = same_size(images.color, images.depth)
     known = benchmark(path, _header(path / "rgb.txt"))
     camera, camera_notes = _camera(path, known, size)
@@ -118,40 +121,9 @@ def interpolate_poses(
     return poses
 
 
-def _rows(path: Path, columns: int) -> list[list[str]]:
-    """The first ``columns`` fields of each line that is no comment. Raises InputError."""
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").split()
-        if fields and len(fields) < columns:
-            raise InputError(f"{path}: line {number} has {len(fields)} of {columns} fields; complete or remove it")
-        if fields:
-            rows.append(fields[:columns])
-    if not rows:
-        raise InputError(f"{path}: lists nothing; it needs lines of {columns} fields, the first a time in seconds")
-    return rows
-
-
-def _numbers(rows: list[list[str]], path: Path) -> NDArray[np.float64]:
-    try:
-        values = np.array(rows, np.float64)
-    except ValueError:
-        raise InputError(
-            f"{path}: holds something that is not a number where one is due; correct or remove that line"
-        ) from None
-    return values
-
-
-def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    rows = _rows(path, 2)
-    times = _numbers([row[:1] for row in rows], path)[:, 0]
-    _require_finite(times, path)
-    return times, [path.parent / row[1] for row in rows]
-
-
-def _require_finite(times: Times, path: Path) -> None:
-    if not np.isfinite(times).all():
-        raise InputError(f"{path}: a time is not finite; correct or remove that line")
+def _read_list(path: Path) -> tuple[Times, list[Path]]:
+    rows = read_rows(path, 2)
+    return to_times([row[0] for row in rows], path), [listed_file(path.parent, row[1]) for row in rows]
 
 
 def _has_lists(path: Path) -> bool:
@@ -184,16 +156,27 @@ def _from_lists(path: Path) -> Images:
 def _from_associations(path: Path) -> Images:
     """The pairs that somebody has made; whether depth comes first, as in ICL-NUIM, is told by the file names."""
     file = _associations(path) or path / ASSOCIATIONS[0]
-    rows = _rows(file, 4)
+    rows = read_rows(file, 4)
     depth_first = sum("depth" in row[1].lower() for row in rows) > sum("depth" in row[3].lower() for row in rows)
     places = {"color": (2, 3), "depth": (0, 1)} if depth_first else {"color": (0, 1), "depth": (2, 3)}
-    times = _numbers([[row[places["depth"][0]]] for row in rows], file)[:, 0]
-    _require_finite(times, file)
-    color, depth = ([path / row[places[what][1]] for row in rows] for what in ("color", "depth"))
+    times = to_times([row[places["depth"][0]] for row in rows], file)
+    color, depth = ([listed_file(path, row[places[what][1]]) for row in rows] for what in ("color", "depth"))
     seen, measured = _present(path, color), _present(path, depth)
     both = np.intersect1d(seen, measured)
     notes = _notes_on_missing([*color, *depth], len(seen) + len(measured))
     return Images(times[both], [color[k] for k in both], [depth[k] for k in both], notes)
+
+
+def _by_time(images: Images) -> Images:
+    """In the order of time where the lists are in none. A few that are out of order keep their places, for their times
+    may be wrong; a run leaves them out."""
+    disordered = len(np.unique(images.times)) - in_order(images.times).sum()
+    if disordered <= max(1, MOST_IN_DISORDER * len(images.times)):
+        return images
+    order = np.argsort(images.times, kind="stable")
+    color, depth = ([files[k] for k in order] for files in (images.color, images.depth))
+    note = "images are not listed in the order of time, but taken in it"
+    return Images(images.times[order], color, depth, (*images.notes, note))
 
 
 def _present(folder: Path, files: list[Path]) -> NDArray[np.int64]:
@@ -263,7 +246,7 @@ def _ground_truth(
         names = ", ".join(each.name for each in files)
         return None, (f"several files of ground truth ({names}), so none is used; leave one",)
     (file,) = files
-    rows = _numbers(_rows(file, 8), file)
+    rows = to_numbers(read_rows(file, 8), file)
     usable = rows[np.isfinite(rows).all(1) & (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.1)]
     if len(usable) == 0:
         raise InputError(
@@ -273,6 +256,9 @@ def _ground_truth(
     poses = interpolate_poses(stamps, usable[first, 1:], times, MAX_DIFFERENCE_S)
     missing = int(np.isnan(poses[:, 0, 0]).sum())
     notes = (f"{missing} of {len(times)} frames have no ground truth within 20 ms",) if missing else ()
+    if missing == len(times):
+        spans = (f"{each.min():.3f} .. {each.max():.3f}" for each in (stamps, times))
+        notes = (*notes, "{} is of times {}, images are of {}".format(file.name, *spans))
     if len(usable) < len(rows):
         notes = (*notes, f"{len(rows) - len(usable)} lines of {file.name} are not poses and are left out")
     return (known.before @ poses @ known.after if known else poses), notes

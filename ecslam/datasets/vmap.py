@@ -11,7 +11,7 @@ from .meshes import first_existing
 from .reading import find_intrinsics, has_numbered, numbered, paired, read_pose_list, same_size
 from .replica import CAMERA, FRAMES_PER_S
 
-COLOR = r"rgb_(\d{1,9})\.(?:png|jpg)"
+COLOR = r"rgb_(\d{1,9})\.(?:png|jpe?g)"
 
 
 def sniff(path: Path) -> bool:
