@@ -1,4 +1,4 @@
-"""Processes that are killed: what is on the disk then, and that SIGTERM and Ctrl-C save and end in time."""
+"""Processes that are killed: what is on the disk then, and that signals save and end in time."""
 
 import json
 import os
@@ -84,7 +84,7 @@ def test_a_kill_costs_at_most_ten_frames_where_they_take_over_three_seconds(tmp_
     assert reached - 10 <= load_checkpoint(tmp_path / "run/checkpoints").frame <= reached
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_saves_and_ends_in_under_five_seconds(tmp_path, number):
     process = start(tmp_path / "run")
     read_until(process, 12)

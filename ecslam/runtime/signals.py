@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first asks the engine to save and stop, the second quits at once."""
+"""Ctrl-C, SIGTERM, and a terminal that closes: the first asks the engine to save and stop, the second quits at once."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from .protocol import EngineHandle
 
 @contextmanager
 def quit_on_signals(engine: EngineHandle) -> Iterator[None]:
-    """Within the block, SIGINT and SIGTERM submit ``Quit``; a second one ends the process with 128 + its number.
+    """Within the block, SIGINT, SIGTERM and SIGHUP submit ``Quit``; another one ends the process with 128 + its number.
 
-    Call it in the main thread.
+    SIGHUP stays ignored where it is (``nohup``). Call it in the main thread.
     """
     asked = False
 
@@ -31,7 +31,10 @@ def quit_on_signals(engine: EngineHandle) -> Iterator[None]:
         # In a thread of its own: the interrupted code may hold the lock that submit takes.
         threading.Thread(target=engine.submit, args=(Quit(),), daemon=True).start()
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield
     finally:
