@@ -216,6 +216,19 @@ def test_eval_finds_a_mesh_equal_to_itself(finished, sequence, tmp_path):
     assert "completion_ratio" in done.out
 
 
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("summary.json", ["summary.json: cannot be read", "ecslam resume"]),
+        ("run.json", ["run.json: missing or damaged"]),
+    ],
+)
+def test_eval_names_the_file_that_is_damaged(finished, tmp_path, name, says):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    (folder / name).write_text((folder / name).read_text()[:40])
+    assert_refused(ecslam("eval", folder), *says)
+
+
 @pytest.mark.parametrize("lacking", ["surface", "mesh", "sequence"])
 def test_eval_gives_the_trajectory_where_there_is_no_surface_to_compare(finished, tmp_path, lacking):
     folder = shutil.copytree(finished, tmp_path / "run")

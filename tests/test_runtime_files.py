@@ -134,7 +134,13 @@ def test_one_process_at_a_time_writes_a_folder(tmp_path):
     RunFolder.reopen(tmp_path, print).close()
 
 
-@pytest.mark.parametrize("content", [None, "{", "[1]", '{"sequence": "room", "frames_total": 3}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(None, "{", "[1]", '{"sequence": "room", "frames_total": 3}'),
+        *(to_json(ABOUT | wrong) for wrong in ({"frames": 7}, {"width": "9"}, {"fx": None})),
+    ],
+)
 def test_a_run_whose_description_is_damaged_is_one_clear_line(tmp_path, content):
     if content is not None:
         (tmp_path / "run.json").write_text(content)

@@ -15,7 +15,8 @@ from ..atomic import write_atomic
 from ..datasets.meshes import NoSurface, load_mesh
 from ..evaluation.trajectory import absolute_error, find_lag, relative_error
 from ..evaluation.trajectory_io import read_tum
-from ..types import InputError, Mesh
+from ..types import InputError, Mesh, words
+from .runfolder import read_about
 
 SAME_S = 1e-6
 LEFT, SAVED_CM = 0.8, 0.2  # a lag is worth saying where it leaves less of the error and saves more
@@ -36,10 +37,9 @@ def judge_run(
     a finished run or ground truth, and for a mesh that is damaged.
     """
     summary_path = folder / "summary.json"
-    try:
-        summary, about = (dict(json.loads((folder / name).read_text())) for name in ("summary.json", "run.json"))
-    except (OSError, ValueError, TypeError):
-        raise InputError(f"{folder}: no finished run here; give the folder that `ecslam run --out` wrote") from None
+    if not summary_path.is_file():
+        raise InputError(f"{folder}: no finished run here; give the folder that `ecslam run --out` wrote")
+    summary, about = _read_summary(summary_path), read_about(folder)
     times, poses = read_tum(folder / "trajectory.txt")
     truth = read_truth(folder, times)
     if truth is None:
@@ -62,6 +62,14 @@ def judge_run(
     except OSError as error:
         tell(f"the figures could not be written into {summary_path} ({error.strerror})")
     return figures
+
+
+def _read_summary(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        onward = f"remove it, and make it again with: ecslam resume {path.parent}"
+        raise InputError(f"{path}: cannot be read ({words(error)}); {onward}") from None
 
 
 def _surface_figures(

@@ -187,7 +187,9 @@ def read_about(folder: Path) -> dict[str, Any]:
         about = dict(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, TypeError):
         about = {}
-    if not about.keys() >= {"sequence", "frames", "frames_total", *CAMERA}:
+    numbers = [about.get(name) for name in ("frames_total", *CAMERA)]
+    texts = [about.get(name) for name in ("sequence", "frames")]
+    if not all(isinstance(each, (int, float)) for each in numbers) or not all(isinstance(each, str) for each in texts):
         raise InputError(f"{path}: missing or damaged; start again with ecslam run")
     return about
 
