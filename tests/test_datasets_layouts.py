@@ -751,6 +751,7 @@ def test_tum_with_odd_times_opens_and_says_so(tmp_path: Path) -> None:
         "1 frames repeat the time of the one before",
         "1 frames go backwards in time",
         "2 gaps of more than 1 s between frames",
+        "only 4 of 6 frames are of use, for time must move on from one to the next",
     ]
 
 

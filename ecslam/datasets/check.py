@@ -247,6 +247,8 @@ def _odd_images(
 ) -> Iterator[str]:
     if unreadable:
         yield f"{len(unreadable)} of {tried} frames are unreadable; a run skips them and stops when over 20 % are"
+    if depth.low_m == depth.high_m:
+        yield f"the depth is {depth.low_m:.3g} m everywhere: is it what the camera measured?"
     if black:
         yield f"{black} of {tried} frames are black"
     if depth.empty:

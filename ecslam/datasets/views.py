@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..types import Frame, InputError, Intrinsics, Mesh, Sequence
 
-GAP_S = 1.0
+GAP_S, LEAST_IN_ORDER = 1.0, 0.8
 UNITS = ((5e6, "nanoseconds"), (5e3, "microseconds"), (5.0, "milliseconds"))  # from which median step on, in seconds
 
 
@@ -127,4 +127,7 @@ def problems(sequence: Sequence) -> list[str]:
         f"gaps of more than {GAP_S:g} s between frames": 0 if unit else int((steps > GAP_S).sum()),
     }
     found += [f"{count} {what}" for what, count in counts.items() if count]
+    kept = int(in_order(sequence.timestamps()).sum())
+    if kept < LEAST_IN_ORDER * len(sequence):
+        found.append(f"only {kept} of {len(sequence)} frames are of use, for time must move on from one to the next")
     return found
