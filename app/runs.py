@@ -21,6 +21,8 @@ from ecslam.types import InputError, Mesh
 
 from .glb import simplify
 
+CAMERA = {"width": 640.0, "height": 480.0, "fy": 500.0}  # for want of better
+
 Array = NDArray[np.float64]
 
 
@@ -71,7 +73,8 @@ def load_run(folder: Path) -> Run:
     if not rows:
         raise InputError(f"{folder / 'metrics.jsonl'}: holds no frame; the run ended before its first one")
     summary = _json(folder / "summary.json")
-    about = {"width": 640, "height": 480, "fy": 500.0, **_json(folder / "run.json")}
+    about = _json(folder / "run.json")
+    width, height, fy = (_number(about.get(name), usual) for name, usual in CAMERA.items())
     timestamps = np.array([float(row.get("timestamp", row["frame"])) for row in rows])
     tracked = np.tile(np.eye(4), (len(rows), 1, 1))
     tracked[:, :3] = np.array([row["c2w"][:12] for row in rows], float).reshape(-1, 3, 4)
@@ -79,7 +82,7 @@ def load_run(folder: Path) -> Run:
     if trajectory is None or np.isnan(trajectory).any():
         trajectory = tracked
     truth = _poses_at(folder / "groundtruth.txt", timestamps)
-    events = [e for e in read_lines(folder / "events.jsonl") if e.get("type") == "loop"]
+    events = [e for e in read_lines(folder / "events.jsonl") if e.get("type") == "loop" and _has_frame(e)]
     return Run(
         folder=folder,
         sequence=str(summary.get("sequence") or about.get("name") or ""),
@@ -91,8 +94,8 @@ def load_run(folder: Path) -> Run:
         keyframes=_keyframes(folder, rows, trajectory),
         loops=tuple(_loop_event(e) for e in events),
         meshes=_meshes(folder, int(rows[-1]["frame"])),
-        fov_y_rad=float(2 * np.arctan(about["height"] / 2 / about["fy"])),
-        aspect=float(about["width"] / about["height"]),
+        fov_y_rad=float(2 * np.arctan(height / 2 / fy)),
+        aspect=width / height,
     )
 
 
@@ -109,7 +112,7 @@ def truth_apart(a: Run, b: Run) -> float:
 
 def frame_rows(folder: Path) -> tuple[dict[str, Any], ...]:
     """A line for each frame that a run folder has on record so far; none where there is no ``metrics.jsonl``."""
-    return tuple(row for row in read_lines(folder / "metrics.jsonl") if {"frame", "c2w"} <= row.keys())
+    return tuple(row for row in read_lines(folder / "metrics.jsonl") if _has_frame(row) and "c2w" in row)
 
 
 def notices_in(folder: Path) -> list[Notice]:
@@ -122,6 +125,14 @@ def notices_in(folder: Path) -> list[Notice]:
 def drawable_mesh(path: Path) -> Mesh:
     """A mesh file within the triangle budget; remembered, as scrubbing comes back to it. Raises InputError."""
     return simplify(load_mesh(path))
+
+
+def _has_frame(line: dict[str, Any]) -> bool:
+    return isinstance(line.get("frame"), int)
+
+
+def _number(value: Any, usual: float) -> float:
+    return float(value) if isinstance(value, (int, float)) and value > 0 else usual
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -153,7 +164,7 @@ def _poses_at(path: Path, timestamps: Array) -> Array | None:
 
 
 def _keyframes(folder: Path, rows: tuple[dict[str, Any], ...], trajectory: Array) -> tuple[KeyframeView, ...]:
-    pictures = {int(k["frame"]): k for k in read_lines(folder / "keyframes.jsonl") if "frame" in k}
+    pictures = {k["frame"]: k for k in read_lines(folder / "keyframes.jsonl") if _has_frame(k)}
     out = []
     for row, c2w in zip(rows, trajectory, strict=True):
         if row.get("keyframe"):

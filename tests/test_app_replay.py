@@ -205,6 +205,26 @@ def test_killed_run_with_a_cut_line_opens(folder, tmp_path):
     assert (run.trajectory_gt, run.loops, run.meshes) == (None, (), {})
 
 
+def test_lines_and_values_of_wrong_types_are_left_out(folder, tmp_path):
+    whole, copy = load_run(folder), tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (copy / "run.json").write_text(json.dumps({"width": "abc", "height": 480, "fy": 0}))
+    for name, line in (
+        ("events.jsonl", '{"type":"loop"}'),
+        ("keyframes.jsonl", '{"frame":"x"}'),
+        ("metrics.jsonl", '{"frame":"x","c2w":[]}'),
+    ):
+        with (copy / name).open("a") as file:
+            file.write(line + "\n")
+    read = load_run(copy)
+    assert (len(read.rows), len(read.keyframes), len(read.loops)) == (
+        len(whole.rows),
+        len(whole.keyframes),
+        len(whole.loops),
+    )
+    assert 0 < read.fov_y_rad < 3
+
+
 def test_without_the_first_true_pose_the_truth_is_not_drawn(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "run")
     truth = tmp_path / "run/groundtruth.txt"

@@ -120,6 +120,15 @@ def test_the_world_is_that_of_the_first_frame_the_engine_can_use(tmp_path):
     assert np.array_equal(make.made[-1].first_pose, circle(12)[2])
 
 
+def test_many_skipped_frames_are_told_a_few_times(tmp_path):
+    empty = tuple(range(1, 251))
+    assert run(tmp_path, FakeSequence(300), Behaviour(empty=empty))["skipped_frames"] == 250
+    told = [e["text"] for e in read_lines(tmp_path / "events.jsonl") if "skipped" in e["text"]]
+    assert len(told) == 22
+    assert told[19].startswith("skipped: frame 20")
+    assert [text.split(",")[0] for text in told[20:]] == [f"skipped: {n} frames so far" for n in (100, 200)]
+
+
 def test_a_sequence_without_a_usable_frame_is_an_error(tmp_path):
     with pytest.raises(InputError, match=r"fake: none of 4 frames could be used.*frame 0: no usable depth"):
         run(tmp_path, FakeSequence(4), Behaviour(empty=(0, 1, 2, 3)))

@@ -36,6 +36,7 @@ TRAJECTORY_EVERY_S, HOLES_EVERY_S = 5.0, 0.4
 THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
+EACH_SKIP, MANY_SKIPS = 20, 100  # skipped frames that are told one by one, and then every how many
 SAME = 1e-6
 GOOD_NEWS = ("relocalised", "recovered", MOVING)
 
@@ -210,7 +211,9 @@ class Run:
     def _skip(self, index: int, why: str) -> None:
         self.tally.skipped += 1
         self.tally.first_skip = self.tally.first_skip or why
-        self.notice("warning", f"skipped: {why}", index)
+        if self.tally.skipped <= EACH_SKIP or self.tally.skipped % MANY_SKIPS == 0:
+            many = f"{self.tally.skipped} frames so far, now as " if self.tally.skipped > EACH_SKIP else ""
+            self.notice("warning", f"skipped: {many}{why}", index)
         frames, bad = len(self.plan.sequence), self.tally.unreadable
         if self.tally.too_many_unreadable(frames):
             raise InputError(
