@@ -6,6 +6,7 @@ import http.client
 import re
 import socket
 import time
+from contextlib import contextmanager
 from urllib.parse import urlsplit
 
 import msgspec
@@ -310,41 +311,41 @@ def test_no_request_waits_for_a_name_server(engine, monkeypatch):
         page.close()
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "0.0.0.0", "::1"])
-def test_the_tunnel_leads_to_the_page(engine, host):
+@contextmanager
+def opened(engine, host):
+    """A page that listens there; the test is skipped where this machine has no such address."""
     try:
         listener = bind(host, 0)
     except InputError:
         pytest.skip(f"this machine has no {host}")
     page = server.start(engine, host=host, listener=listener)
     try:
+        yield page
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "0.0.0.0", "::1"])
+def test_the_tunnel_leads_to_the_page(engine, host):
+    with opened(engine, host) as page:
         near, there, port, address = re.match(r"ssh -L (\d+):(.+):(\d+) <.*>, then open (\S+)", page.ssh_hint).groups()
         assert address.startswith(f"http://localhost:{near}/")
         with socket.create_connection((there.strip("[]"), int(port)), 5) as tunnel:
             tunnel.sendall(f"GET {urlsplit(address).path}?{urlsplit(address).query} HTTP/1.1\r\n".encode())
             tunnel.sendall(f"Host: {urlsplit(address).netloc}\r\n\r\n".encode())
             assert tunnel.recv(12) in (b"HTTP/1.1 200", b"HTTP/1.1 303")
-    finally:
-        page.close()
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_an_open_page_says_under_which_addresses_other_machines_find_it(engine, host, monkeypatch):
     monkeypatch.setattr(socket, "gethostname", lambda: "here")
-    try:
-        listener = bind(host, 0)
-    except InputError:
-        pytest.skip(f"this machine has no {host}")
-    page = server.start(engine, host=host, listener=listener)
-    try:
+    with opened(engine, host) as page:
         *addresses, name = page.elsewhere
         assert name == page.url.replace("localhost", "here")
         for address in (*addresses, name):
             there = urlsplit(address)
             assert not front.is_loopback(there.hostname)
             assert get(page, f"/?{there.query}", Host=there.netloc)[0].status == 303
-    finally:
-        page.close()
 
 
 def test_addresses_elsewhere_are_those_that_this_machine_sends_from(monkeypatch):

@@ -234,10 +234,10 @@ def step(
             into is not None, want_poses, losses, partial, sums,
         )  # fmt: skip
     if into is not None:
-        table = params.table, *((adam.mean[0], adam.square[0]) if adam else (into.table, into.table))
+        moments = (adam.mean[0], adam.square[0]) if adam else (into.table, into.table)
         _spread(
             threads, table_worker, keep, buffers, CHUNK_RAYS, grid, net.padded, count, samples,
-            *(tensor.numpy().reshape(-1) for tensor in (into.table, *table)),
+            *(tensor.view(-1).numpy() for tensor in (into.table, params.table, *moments)),
             _adam_numbers(adam) if adam else np.empty(0, np.float32),
         )  # fmt: skip
         targets = (t.numpy() for t in (into.w_in, into.w_sdf, into.w_rgb, into.beta))
@@ -292,7 +292,7 @@ def map_step(parameters: list[Tensor], gradients: list[Tensor], adam: AdamStep) 
     """See ``reference.map_step``."""
     numbers = _adam_numbers(adam)
     for several in zip(parameters, gradients, adam.mean, adam.square, strict=True):
-        adam_worker(*(tensor.numpy().reshape(-1) for tensor in several), numbers)
+        adam_worker(*(tensor.view(-1).numpy() for tensor in several), numbers)
 
 
 def _adam_numbers(adam: AdamStep) -> Floats:
