@@ -49,7 +49,7 @@ class WallGrids:
         """Show one viewer a grid that faces ``side`` [3], ``depth`` metres away from the floor's middle [3], one of its
         lines level with the floor."""
         self.take_down(client)
-        self._grids = {number: self._grids[number] for number in self._grids.keys() & self._server.get_clients()}
+        self._forget_who_left()
         grid = self._grids[client.client_id] = add_grid(client.scene, "/wall", self._dark)
         grid.wxyz, grid.position = standing(up, side), floor - (depth + GAP_M) * side
 
@@ -62,5 +62,9 @@ class WallGrids:
     def set_dark(self, dark: bool) -> None:
         """Draw all of them, and those to come, for a dark or a light page."""
         self._dark = dark
+        self._forget_who_left()
         for grid in self._grids.values():
             paint(grid, dark)
+
+    def _forget_who_left(self) -> None:
+        self._grids = {number: self._grids[number] for number in self._grids.keys() & self._server.get_clients()}

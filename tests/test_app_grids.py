@@ -77,3 +77,15 @@ def test_the_grid_behind_a_wall_is_dark_on_a_dark_page(page):
         press(page, connection, "Look from", "The side")
         assert until(lambda: page.hub.views.walls._grids)
         assert tuple(next(iter(page.hub.views.walls._grids.values())).cell_color) == theme.GRID[1]
+
+
+def test_the_grid_of_a_viewer_that_has_left_is_forgotten(page, recwarn):
+    with dial(page) as connection:
+        enter(connection)
+        assert until(lambda: list(page.hub.viewers()))
+        press(page, connection, "Look from", "The side")
+        assert until(lambda: page.hub.views.walls._grids)
+    assert until(lambda: not list(page.hub.viewers()))
+    page.hub.views.walls.set_dark(True)
+    assert not page.hub.views.walls._grids
+    assert not [w for w in recwarn if "closed connection" in str(w.message)]
