@@ -30,13 +30,13 @@ from ecslam.messages import (
     Snapshot,
 )
 from ecslam.runtime.protocol import EngineHandle
+from ecslam.runtime.runfolder import frame_rows
 
 from . import hints, theme
 from .broadcast import downloading
 from .history import History, history_of, with_last_mapping
 from .panel import TABS, BasePanel, find_panels
 from .replay import ReplayEngine
-from .runs import frame_rows
 from .scene import Scene
 from .views import Views
 

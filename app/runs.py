@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ecslam.datasets.meshes import load_mesh
 from ecslam.messages import KeyframeView, LoopEvent, Notice
 from ecslam.runtime.files import read_lines
+from ecslam.runtime.runfolder import frame_rows, has_frame
 from ecslam.types import InputError, Mesh
 
 from .glb import simplify
@@ -82,7 +83,7 @@ def load_run(folder: Path) -> Run:
     if trajectory is None or np.isnan(trajectory).any():
         trajectory = tracked
     truth = _poses_at(folder / "groundtruth.txt", timestamps)
-    events = [e for e in read_lines(folder / "events.jsonl") if e.get("type") == "loop" and _has_frame(e)]
+    events = [e for e in read_lines(folder / "events.jsonl") if e.get("type") == "loop" and has_frame(e)]
     return Run(
         folder=folder,
         sequence=str(summary.get("sequence") or about.get("name") or ""),
@@ -110,11 +111,6 @@ def truth_apart(a: Run, b: Run) -> float:
     return float(np.median(known)) if len(known) else 0.0
 
 
-def frame_rows(folder: Path) -> tuple[dict[str, Any], ...]:
-    """A line for each frame that a run folder has on record so far; none where there is no ``metrics.jsonl``."""
-    return tuple(row for row in read_lines(folder / "metrics.jsonl") if _has_frame(row) and "c2w" in row)
-
-
 def notices_in(folder: Path) -> list[Notice]:
     """What a run folder has on record for a person to read, oldest first."""
     lines = [line for line in read_lines(folder / "events.jsonl") if line.get("type") == "notice"]
@@ -125,10 +121,6 @@ def notices_in(folder: Path) -> list[Notice]:
 def drawable_mesh(path: Path) -> Mesh:
     """A mesh file within the triangle budget; remembered, as scrubbing comes back to it. Raises InputError."""
     return simplify(load_mesh(path))
-
-
-def _has_frame(line: dict[str, Any]) -> bool:
-    return isinstance(line.get("frame"), int)
 
 
 def _number(value: Any, usual: float) -> float:
@@ -164,7 +156,7 @@ def _poses_at(path: Path, timestamps: Array) -> Array | None:
 
 
 def _keyframes(folder: Path, rows: tuple[dict[str, Any], ...], trajectory: Array) -> tuple[KeyframeView, ...]:
-    pictures = {k["frame"]: k for k in read_lines(folder / "keyframes.jsonl") if _has_frame(k)}
+    pictures = {k["frame"]: k for k in read_lines(folder / "keyframes.jsonl") if has_frame(k)}
     out = []
     for row, c2w in zip(rows, trajectory, strict=True):
         if row.get("keyframe"):

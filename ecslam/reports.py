@@ -17,8 +17,8 @@ from .evaluation.trajectory_io import read_tum
 from .messages import Snapshot, State
 from .runtime.checkpoint import newest_frame
 from .runtime.engine import Engine
-from .runtime.files import read_lines
 from .runtime.judge import read_mesh, read_truth
+from .runtime.runfolder import frame_rows
 from .types import InputError
 
 console = Console(markup=False)
@@ -112,7 +112,7 @@ def draw_picture(folder: Path) -> Path | None:
     summary = json.loads((folder / "summary.json").read_text())
     title = f"{summary['sequence']}, {summary['preset']}: {summary['fps_wall']:.1f} frames/s"
     drawn = BytesIO()
-    frames = np.array([row["frame"] for row in read_lines(folder / "metrics.jsonl") if "frame" in row], np.int64)
+    frames = np.array([row["frame"] for row in frame_rows(folder)], np.int64)
     plot_run(drawn, mesh, poses, truth, title, frames if len(frames) == len(poses) else None)
     write_atomic(folder / "picture.png", drawn.getvalue())
     return folder / "picture.png"

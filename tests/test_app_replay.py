@@ -21,12 +21,13 @@ from ecslam_app.panels.compare import figures_table
 from ecslam_app.past import Past
 from ecslam_app.record import html_replay
 from ecslam_app.replay import ReplayEngine
-from ecslam_app.runs import frame_rows, load_run
+from ecslam_app.runs import load_run
 
 from ecslam import messages as m
 from ecslam.runtime import engine as live
 from ecslam.runtime.exports import zip_run
 from ecslam.runtime.protocol import EngineHandle
+from ecslam.runtime.runfolder import frame_rows
 from ecslam.types import InputError, Mesh
 from tests.fake_engine import FakeEngine, room_mesh, walk, write_run
 from tests.fake_slam import QUICK, Behaviour, FakeSequence, maker

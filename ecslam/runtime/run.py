@@ -22,6 +22,7 @@ from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
+from .continued import require_same_camera, require_same_times
 from .driven import Abandoned, SlamFactory, SlamLike
 from .driven import State as Arrays
 from .memory import return_holes
@@ -37,7 +38,6 @@ THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
 EACH_SKIP, MANY_SKIPS = 20, 100  # skipped frames that are told one by one, and then every how many
-SAME = 1e-6
 GOOD_NEWS = ("relocalised", "recovered", MOVING)
 
 
@@ -91,10 +91,10 @@ class Run:
         self._settled = False
         if resumed:
             about = read_about(folder.path)
-            self._require_same_camera(about)
+            require_same_camera(plan.address, plan.sequence, about)
             self._settled = bool(resumed.meta["finished"])
             self._build(None, resumed.arrays)
-            self._require_same_times()
+            require_same_times(plan.address, plan.sequence, self.tally, self.timestamps())
             folder.go_on(resumed.frame)
             folder.write("run.json", about | {"sequence": plan.address})
             self.loops = folder.loops()
@@ -119,26 +119,6 @@ class Run:
         if self.truth is not None:
             known = np.isfinite(self.truth).all((1, 2)) & self._in_order
             self.folder.write("groundtruth.txt", format_tum(s.timestamps()[known], self.truth[known]))
-
-    def _require_same_camera(self, about: dict[str, Any]) -> None:
-        """Raises InputError when the sequence is not the one that the run was begun with."""
-        now = self.plan.sequence.intrinsics
-        for name in CAMERA:
-            was, here = about[name], getattr(now, name)
-            if not abs(was - here) < SAME:
-                raise InputError(
-                    f"{self.plan.address}: not the sequence that this run was begun with ({name} was {was:g} and is "
-                    f"{here:g}); give that one with --sequence"
-                )
-
-    def _require_same_times(self) -> None:
-        """Raises InputError when the frames that are done are not those of the sequence."""
-        times, rows, known = self.plan.sequence.timestamps(), np.array(self.tally.rows, np.int64), self.timestamps()
-        if len(times) < self.tally.position or (len(rows) and np.abs(times[rows] - known).max() > SAME):
-            raise InputError(
-                f"{self.plan.address}: its frames are no longer those that this run has done ({self.tally.position} of "
-                f"them; there are {len(times)} now); put them back or start again with ecslam run"
-            )
 
     # ---- frames ---------------------------------------------------------------------------------------------------
 

@@ -194,6 +194,16 @@ def read_about(folder: Path) -> dict[str, Any]:
     return about
 
 
+def has_frame(line: dict[str, Any]) -> bool:
+    """Whether a line of a log says which frame it is about."""
+    return isinstance(line.get("frame"), int)
+
+
+def frame_rows(folder: Path) -> tuple[dict[str, Any], ...]:
+    """A line for each frame that a run folder has on record so far; none where there is no ``metrics.jsonl``."""
+    return tuple(row for row in read_lines(folder / "metrics.jsonl") if has_frame(row) and "c2w" in row)
+
+
 def _holds_a_run(path: Path) -> bool:
     """Whether a folder holds a run, or nothing but what a run begins with: a recording may have a ``mesh.ply`` and a
     ``groundtruth.txt`` too."""
