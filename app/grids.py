@@ -50,8 +50,9 @@ class WallGrids:
         lines level with the floor."""
         self.take_down(client)
         self._forget_who_left()
-        grid = self._grids[client.client_id] = add_grid(client.scene, "/wall", self._dark)
+        grid = add_grid(client.scene, "/wall", self._dark)
         grid.wxyz, grid.position = standing(up, side), floor - (depth + GAP_M) * side
+        self._grids[client.client_id] = grid
 
     def take_down(self, client: viser.ClientHandle) -> None:
         """Take one viewer's grid away."""

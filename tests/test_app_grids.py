@@ -11,7 +11,7 @@ from ecslam_app.grids import GAP_M
 
 from ecslam.types import Mesh
 from tests.fake_engine import FakeEngine, room_mesh
-from tests.test_app_security import dial, enter, press, until
+from tests.test_app_security import dial, enter, press, until, viewing
 
 TILTED = vt.SO3.exp(np.array([0.2, -0.1, 0.4])).as_matrix()
 
@@ -27,6 +27,11 @@ def page(tmp_path, monkeypatch):
     yield page
     page.close()
     engine.stop()
+
+
+def backwards(camera):
+    back = np.array(camera.position) - np.array(camera.look_at)
+    return back / np.linalg.norm(back)
 
 
 def test_a_standing_grid_has_up_and_front_where_they_belong():
@@ -46,6 +51,7 @@ def test_who_looks_straight_at_a_wall_alone_has_a_grid_behind_it(page):
         viewer = next(iter(page.hub.viewers()))
         enter(other)
         assert until(lambda: len(list(page.hub.viewers())) == 2)
+        assert until(lambda: len(page.hub.views._framed) == 2), "the first views would take grids down again"
         for leaving in (("Look from", "Above"), ("Reset view", True), ("Follow camera", True)):
             press(page, connection, "Look from", "The side")
             assert until(lambda: viewer.client_id in page.hub.views.walls._grids)
@@ -57,16 +63,13 @@ def test_who_looks_straight_at_a_wall_alone_has_a_grid_behind_it(page):
             assert (place - scene.floor) @ up == pytest.approx(0, abs=1e-6), "a line lies where the floor does"
             assert ((scene.mesh.vertices - place) @ front).min() == pytest.approx(GAP_M, abs=1e-4)
             assert until(lambda: np.isclose(viewer.camera.fov, views.STRAIGHT_FOV_RAD))
-            back = np.array(viewer.camera.position) - np.array(viewer.camera.look_at)
-            assert np.allclose(back / np.linalg.norm(back), front, atol=1e-3)
+            assert until(lambda front=front: np.allclose(backwards(viewer.camera), front, atol=1e-3))
             press(page, connection, *leaving)
             assert until(lambda: not page.hub.views.walls._grids), leaving
 
 
 def test_the_grid_behind_a_wall_is_dark_on_a_dark_page(page):
-    with dial(page) as connection:
-        enter(connection)
-        assert until(lambda: list(page.hub.viewers()))
+    with viewing(page) as connection:
         press(page, connection, "Look from", "The side")
         assert until(lambda: page.hub.views.walls._grids)
         (grid,) = page.hub.views.walls._grids.values()
@@ -80,9 +83,7 @@ def test_the_grid_behind_a_wall_is_dark_on_a_dark_page(page):
 
 
 def test_the_grid_of_a_viewer_that_has_left_is_forgotten(page, recwarn):
-    with dial(page) as connection:
-        enter(connection)
-        assert until(lambda: list(page.hub.viewers()))
+    with viewing(page) as connection:
         press(page, connection, "Look from", "The side")
         assert until(lambda: page.hub.views.walls._grids)
     assert until(lambda: not list(page.hub.viewers()))

@@ -23,7 +23,7 @@ from ecslam import messages as m
 from ecslam.runtime.engine import Engine
 from tests.fake_engine import FakeEngine, write_run
 from tests.fake_slam import QUICK, FakeSequence, maker
-from tests.test_app_security import control, dial, enter, hit, press, until
+from tests.test_app_security import control, dial, enter, hit, press, until, viewing
 
 PANELS = find_panels()
 
@@ -194,9 +194,7 @@ def test_a_restart_takes_back_what_was_tuned(tmp_path):
     try:
         for again in (m.Restart(), m.LoadPreset(QUICK.preset)):
             assert until(lambda: page.hub.current is not None and page.hub.current.frame in range(3, 60))
-            with dial(page) as client:
-                enter(client)
-                assert until(lambda: list(page.hub.viewers()))
+            with viewing(page) as client:
                 press(page, client, "Mapping iterations", 33)
                 assert until(lambda: engine._control.config.mapping.iterations == 33)
             engine.submit(again)
@@ -408,9 +406,7 @@ def test_an_export_that_fails_is_no_longer_under_way(page, engine, monkeypatch):
     monkeypatch.setattr(page.hub, "toast", lambda title, text, color, client=None: told.append((title, text)))
     monkeypatch.setattr(engine, "_carry_out", lambda number, command: None)
     engine.start()
-    with dial(page) as client:
-        enter(client)
-        assert until(lambda: list(page.hub.viewers()))
+    with viewing(page) as client:
         press(page, client, "Export keyframes", True)
         assert until(lambda: page.hub._under_way)
         (number,) = page.hub._under_way
@@ -423,9 +419,7 @@ def test_pictures_are_asked_for_the_more_seldom_the_longer_they_take(engine, pag
     panel = next(p for p in page.hub.panels if p.tab == "Pictures")
     s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)
     pictures = m.FramePictures(9, *[np.zeros((2, 2, 3), np.uint8)] * 6, took_s=0.3)
-    with dial(page) as client:
-        enter(client)
-        assert until(lambda: list(page.hub.viewers()))
+    with viewing(page):
         panel.snapshot(replace(s, frame=10))
         panel._asked -= 9.0
         panel.event(pictures)

@@ -86,6 +86,15 @@ def enter(client):
     say(client, "ViewerCameraMessage", **CAMERA)
 
 
+@contextmanager
+def viewing(page):
+    """The connection of the page's first viewer, once the page knows it."""
+    with dial(page) as connection:
+        enter(connection)
+        assert until(lambda: list(page.hub.viewers()))
+        yield connection
+
+
 def control(page, label):
     """uuid and handle of the GUI control with this label (or option, for a group of buttons)."""
     for uuid, handle in page.hub.server.gui._gui_input_handle_from_uuid.items():

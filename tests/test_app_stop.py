@@ -10,7 +10,7 @@ from ecslam_app.panels.control import CANCEL, FOR_GOOD, REALLY
 
 from ecslam import messages as m
 from tests.fake_engine import FakeEngine
-from tests.test_app_security import control, dial, enter, press, until
+from tests.test_app_security import control, press, until, viewing
 
 
 @pytest.fixture
@@ -25,15 +25,13 @@ def page(tmp_path):
 
 @pytest.fixture
 def viewer(page):
-    with dial(page) as connection:
-        enter(connection)
-        assert until(lambda: list(page.hub.viewers()))
+    with viewing(page) as connection:
         yield connection
 
 
 def asked(page):
     panel = next(p for p in page.hub.panels if hasattr(p, "_sure"))
-    assert panel._warning.visible == panel._sure.visible
+    assert until(lambda: panel._warning.visible == panel._sure.visible)
     assert FOR_GOOD in panel._warning.content
     return panel._sure.visible
 

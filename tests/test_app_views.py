@@ -9,7 +9,7 @@ from ecslam_app.geometry import behind, overview, square_side, sticks_out
 
 from ecslam.types import Mesh
 from tests.fake_engine import FakeEngine, room_mesh
-from tests.test_app_security import CAMERA, dial, enter, press, say, until
+from tests.test_app_security import CAMERA, dial, enter, press, say, until, viewing
 
 BOX = np.array(np.meshgrid([-2.0, 2], [-2.0, 2], [0.0, 2])).reshape(3, -1).T
 
@@ -27,9 +27,7 @@ def page(tmp_path, monkeypatch):
 
 @pytest.fixture
 def viewer(page):
-    with dial(page) as connection:
-        enter(connection)
-        assert until(lambda: list(page.hub.viewers()))
+    with viewing(page) as connection:
         client = next(iter(page.hub.viewers()))
         assert until(lambda: page.hub.views._framed)
         where = page.hub.views._framed[client.client_id].position
