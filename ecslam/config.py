@@ -162,7 +162,8 @@ class Config:
     """Everything a run depends on besides the sequence. Defaults are the paper's lite preset on Replica.
 
     denoise: smooth depth by as much as it is noisy (ours). deskew: take out the motion during a rolling shutter (ours,
-    see ``shutter``). movers: whether what moves by itself is left in (ours, see ``movers``).
+    see ``shutter``). exposure: bring colours to the first frame's exposure and white balance (ours, see ``exposure``).
+    movers: whether what moves by itself is left in (ours, see ``movers``).
     """
 
     preset: str = "lite"
@@ -176,6 +177,7 @@ class Config:
     depth_near_m: float = _number(0.1, 0.0, 10.0)
     depth_far_m: float = _number(8.0, 0.1, 100.0)
     denoise: bool = True
+    exposure: bool = True
     movers: bool = False
     border_px: int = _number(20, 0, 200)
     feature_count: int = _number(200, 0, 10_000)

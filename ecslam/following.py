@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from .align import LearnedSurface, Surface
 from .config import Config
+from .earlier import EarlierViews
+from .exposure import AS_AT_FIRST, exposed, gains
 from .field import TsdfField
 from .kernels import Backend
 from .kernels.graphs import Recorder
 from .keyframes import Keyframe
-from .movers import Movers
+from .movers import without_movers
 from .observed import ObservedVoxels
 from .observed_gpu import ObservedTable
 from .recovery import SUDDEN_DEG, SUDDEN_M, Recovery, around, best_start, near
@@ -61,7 +63,7 @@ class Follower:
         self._generator = generator if device.type == "cpu" else None
         self.recorder = Recorder(plain=kernels_name != "gpu")
         self.recovery = Recovery()
-        self._movers = Movers(camera)
+        self._earlier, self._gains = EarlierViews(), AS_AT_FIRST
         lengths, fused = (config.align.voxel_m, config.truncation_m), config.align.to == "fused"
         self._volume = create_volume(kernels_name, *lengths, device, self.recorder) if fused else None
         self._observed: ObservedVoxels | ObservedTable = ObservedVoxels()
@@ -83,15 +85,26 @@ class Follower:
         known = not (gap or self.recovery.lost)
         return Expected(trajectory.predict(frame.timestamp) if known else trajectory[-1], known, gap)
 
+    def exposed(self, frame: Frame, expected: Expected, trajectory: Trajectory, config: Config) -> Frame:
+        """The frame with the colours that it would have at the exposure and white balance of the first one; those of
+        the frame before count where it is not known what earlier keyframes saw of it."""
+        if not config.exposure:
+            return frame
+        if expected.known:
+            known = self._earlier.asked, trajectory.keyframe_poses()
+            self._gains = gains(frame, self._camera, expected.c2w, *known, self._gains)
+        return exposed(frame, self._gains)
+
     def still(self, frame: Frame, expected: Expected, trajectory: Trajectory, config: Config) -> Frame:
         """The frame without what moves by itself, where it is known what was there before."""
         if config.movers or not expected.known:
             return frame
-        return self._movers.without(frame, expected.c2w, trajectory.keyframe_poses())
+        return without_movers(frame, self._camera, expected.c2w, self._earlier.asked, trajectory.keyframe_poses())
 
     def remember(self, frame: Frame, keyframe: int) -> None:
-        """Keep what a frame saw that became the keyframe number ``keyframe``: what is new there later has come."""
-        self._movers.remember(frame, keyframe)
+        """Keep what a frame saw that became the keyframe number ``keyframe``: what is new there later has come, and
+        what is brighter there is exposed for longer."""
+        self._earlier.remember(frame, keyframe)
 
     def follow(
         self,
@@ -151,7 +164,8 @@ class Follower:
         return {
             **prefixed("observed", self._observed.state() | {"trained": np.array(self._trusted)}),
             **prefixed("volume", self._volume.state() if self._volume is not None else {}),
-            **prefixed("movers", self._movers.state()),
+            **prefixed("earlier", self._earlier.state()),
+            "gains": self._gains,
             "lost": self.recovery.state(),
         }
 
@@ -161,5 +175,6 @@ class Follower:
         self._trusted = int(state["observed.trained"])
         if self._volume is not None:
             self._volume.load(part("volume", state))
-        self._movers.load(part("movers", state))
+        self._earlier.load(part("earlier", state))
+        self._gains = state["gains"]
         self.recovery.load(state["lost"])

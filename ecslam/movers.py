@@ -9,95 +9,40 @@ belongs to the room once the keyframes that saw through it are no longer asked.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .earlier import Cells, Views, cell_lens, cell_px, relief_of
 from .kernels import earlier_views
 from .rigid import inverse
 from .types import Frame, Intrinsics
 
-COLUMNS, SAMPLES = 64, 4  # cells in a row of the image, and pixels of a cell's row or column that are looked at
-KEPT, EVERY = 17, 2  # keyframes that are remembered, and each which of them is asked
 FRONT_M, FRONT_PER_M = 0.1, 0.03  # a point has come that is so much nearer than what was seen
 LEAST, MOST = 0.006, 0.7  # of all cells: fewer are noise, more are a wrong pose
 SLOPE = 0.03  # of the depth, between neighbouring cells of one surface
 
-Cells = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
-class Movers:
-    """Remembers what the last keyframes saw. The engine thread alone writes it."""
-
-    def __init__(self, camera: Intrinsics) -> None:
-        self._camera = camera
-        self._seen: list[NDArray[np.float32]] = []
-        self._keyframes: list[int] = []
-        self._ask()
-
-    def _ask(self) -> None:
-        """Work out which of what is remembered is asked from now on."""
-        asked = range(len(self._seen))[::-EVERY]
-        self._asked = np.array([self._seen[i] for i in asked]), [self._keyframes[i] for i in asked]
-
-    def remember(self, frame: Frame, keyframe: int) -> None:
-        """Keep what a frame saw that is the keyframe number ``keyframe``."""
-        self._seen = [*self._seen, around(_relief_of(frame))][-KEPT:]
-        self._keyframes = [*self._keyframes, keyframe][-KEPT:]
-        self._ask()
-
-    def without(self, frame: Frame, c2w: NDArray[np.float64], keyframe_poses: NDArray[np.float64]) -> Frame:
-        """The frame, seen from about c2w [4, 4], with no depth where something has come; itself where nothing has.
-        keyframe_poses: [K, 4, 4] of all keyframes."""
-        seen, keyframes = self._asked
-        if not keyframes:
-            return frame
-        near, cell = _relief_of(frame), cell_px(frame.depth)
-        came, settled = compare(near, cell_lens(self._camera, cell), c2w, seen, keyframe_poses[keyframes])
-        region = grown(large(came), near, ~settled)
-        if not region.any() or region.mean() > MOST:
-            return frame
-        hidden = cv2.dilate(region.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-        sides = zip(frame.depth.shape, near.shape, strict=True)
-        rows, columns = (np.minimum(np.arange(pixels) // cell, cells - 1) for pixels, cells in sides)
-        left = np.where(hidden[rows][:, columns], np.float32(0), frame.depth)
-        return replace(frame, depth=left, relief=None, keyframe=None)
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """What ``load`` needs."""
-        return {"seen": np.array(self._seen, np.float32), "keyframes": np.array(self._keyframes, np.int64)}
-
-    def load(self, state: dict[str, NDArray[Any]]) -> None:
-        """Go on from what ``state`` gave."""
-        self._seen, self._keyframes = list(state["seen"]), state["keyframes"].tolist()
-        self._ask()
-
-
-def _relief_of(frame: Frame) -> Cells:
-    return relief(frame.depth) if frame.relief is None else frame.relief
-
-
-def cell_px(depth: NDArray[np.float32]) -> int:
-    """The side of a cell of an image in pixels."""
-    return max(1, round(depth.shape[1] / COLUMNS))
-
-
-def cell_lens(camera: Intrinsics, cell: int) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of a camera whose pixels are the cells."""
-    middle = (cell - 1) / 2
-    return camera.fx / cell, camera.fy / cell, (camera.cx - middle) / cell, (camera.cy - middle) / cell
-
-
-def relief(depth: NDArray[np.float32]) -> Cells:
-    """The nearest depth in each cell [h, w] of an image, 0 where less than half of the cell is measured."""
-    cell = cell_px(depth)
-    inside = ((np.arange(SAMPLES) + 0.5) * cell / SAMPLES).astype(np.int64)
-    out = np.empty([side // cell for side in depth.shape], np.float32)
-    earlier_views.nearest(np.ascontiguousarray(depth, np.float32), cell, inside, out)
-    return out
+def without_movers(
+    frame: Frame, camera: Intrinsics, c2w: NDArray[np.float64], earlier: Views, keyframe_poses: NDArray[np.float64]
+) -> Frame:
+    """The frame, seen from about c2w [4, 4], with no depth where something has come since ``earlier`` views; itself
+    where nothing has. keyframe_poses: [K, 4, 4] of all keyframes."""
+    if not earlier.keyframes:
+        return frame
+    near, cell = relief_of(frame), cell_px(frame.depth.shape[1])
+    came, settled = compare(near, cell_lens(camera, cell), c2w, earlier.seen, keyframe_poses[earlier.keyframes])
+    region = grown(large(came), near, ~settled)
+    if not region.any() or region.mean() > MOST:
+        return frame
+    hidden = cv2.dilate(region.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    sides = zip(frame.depth.shape, near.shape, strict=True)
+    rows, columns = (np.minimum(np.arange(pixels) // cell, cells - 1) for pixels, cells in sides)
+    left = np.where(hidden[rows][:, columns], np.float32(0), frame.depth)
+    return replace(frame, depth=left, relief=None, keyframe=None)
 
 
 def compare(
@@ -142,11 +87,3 @@ def grown(region: Mask, near: Cells, free: Mask) -> Mask:
             break
         region = region | more
     return region
-
-
-def around(seen: Cells) -> NDArray[np.float32]:
-    """The nearest and the farthest depth in and around each cell [2, h, w] of a view [h, w]; 0 where there is none in
-    it."""
-    square, known = np.ones((3, 3), np.uint8), seen > 0
-    nearest = cv2.erode(np.where(known, seen, np.float32(np.inf)), square)
-    return np.stack([np.where(known, nearest, np.float32(0)), cv2.dilate(seen, square)]).astype(np.float32)

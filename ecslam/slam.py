@@ -108,6 +108,7 @@ class Slam:
         started = time.perf_counter()
         self._apply_pending(block=False)
         expected = self._follower.expected(frame, self.trajectory)
+        frame = self._follower.exposed(frame, expected, self.trajectory, self.config)
         seen, frame = frame, self._follower.still(frame, expected, self.trajectory, self.config)
         if frame is not seen and not self._moving:
             self._note = MOVING

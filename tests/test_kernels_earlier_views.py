@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 
 from ecslam.datasets import open_sequence
-from ecslam.movers import FRONT_M, FRONT_PER_M, SAMPLES, around, cell_lens, cell_px, compare, relief
+from ecslam.earlier import SAMPLES, around, cell_lens, cell_px, relief, tint
+from ecslam.exposure import WITHIN_M, WITHIN_PER_M
+from ecslam.kernels import earlier_views
+from ecslam.movers import FRONT_M, FRONT_PER_M, compare
 from ecslam.rigid import inverse
 
 ROOM = open_sequence("synthetic/apartment?size=320x240&frames=120&visitor=1")
 
 
 def nearest_in_cells(depth: np.ndarray) -> np.ndarray:
-    cell = cell_px(depth)
+    cell = cell_px(depth.shape[1])
     inside = ((np.arange(SAMPLES) + 0.5) * cell / SAMPLES).astype(int)
     rows, columns = (side // cell * cell for side in depth.shape)
     looked_at = np.stack([depth[v:rows:cell, u:columns:cell] for v in inside for u in inside])
@@ -62,7 +65,7 @@ def test_what_has_come_and_what_is_settled_is_what_numpy_says(now):
     views = [ROOM[i] for i in range(0, now, 8)]
     seen, poses = np.stack([around(relief(view.depth)) for view in views]), np.stack([view.c2w_gt for view in views])
     frame = ROOM[now]
-    lens = cell_lens(ROOM.intrinsics, cell_px(frame.depth))
+    lens = cell_lens(ROOM.intrinsics, cell_px(frame.depth.shape[1]))
     came, settled = compare(relief(frame.depth), lens, frame.c2w_gt, seen, poses)
     expected = held_against(relief(frame.depth), lens, frame.c2w_gt, seen, poses)
     sure = expected >= 0
@@ -71,3 +74,42 @@ def test_what_has_come_and_what_is_settled_is_what_numpy_says(now):
     assert came.any()
     assert settled.any()
     assert not settled.all()
+
+
+@pytest.mark.parametrize(("every", "stride"), [(1, 1), (2, 2), (1, 3)])
+def test_ratios_are_those_of_the_cells_that_see_the_same(every, stride):
+    views = [ROOM[i] for i in range(0, 72, 8)]
+    reliefs, poses = [relief(view.depth) for view in views], np.stack([view.c2w_gt for view in views])
+    frame = ROOM[73]
+    near, colors, cell = relief(frame.depth), tint(frame.color), cell_px(frame.depth.shape[1])
+    assert np.isnan(colors).any()
+    lens = np.array(cell_lens(ROOM.intrinsics, cell), np.float32)
+    seen, tints = np.stack([around(r) for r in reliefs]), np.stack([tint(view.color) for view in views])
+    to_view, within = (
+        (inverse(poses) @ frame.c2w_gt)[:, :3].astype(np.float32),
+        np.array([WITHIN_M, WITHIN_PER_M], np.float32),
+    )
+    out = np.full((3, len(views) * near.size), np.nan, np.float32)
+    found = earlier_views.ratios(near, colors, lens, to_view, seen, tints, within, every, stride, out)
+    assert np.isnan(out[:, found:]).all()
+    assert np.isfinite(out[:, :found]).all()
+    expected = []
+    v, u = (side[::stride, ::stride].ravel() for side in np.indices(near.shape))
+    z, (fx, fy, cx, cy) = near[v, u], lens
+    local = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z])
+    for m, (least, most), theirs in list(zip(to_view, seen, tints, strict=True))[::every]:
+        x, y, ahead = m[:, :3] @ local + m[:, 3:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column, row = np.floor(x / ahead * fx + cx + 0.5), np.floor(y / ahead * fy + cy + 0.5)
+        there = (z > 0) & (ahead > 0) & (column >= 0) & (row >= 0) & (column < near.shape[1]) & (row < near.shape[0])
+        at = np.where(there, row, 0).astype(int), np.where(there, column, 0).astype(int)
+        margin = WITHIN_M + WITHIN_PER_M * least[at]
+        there &= (least[at] > 0) & (ahead > least[at] - margin) & (ahead < most[at] + margin)
+        ratio = theirs[at] - colors[v, u]
+        expected.append(ratio[there & np.isfinite(ratio).all(1)])
+    expected = np.concatenate(expected)
+    assert found == pytest.approx(len(expected), rel=0.02)
+    assert found > 300 / stride**2
+    assert np.quantile(out[:, :found], (0.1, 0.5, 0.9), 1) == pytest.approx(
+        np.quantile(expected, (0.1, 0.5, 0.9), 0), abs=5e-3
+    )

@@ -26,6 +26,7 @@ LAYERS = (
     (
         "datasets",
         "denoising",
+        "earlier",
         "movers",
         "pixels",
         "pixels_gpu",
@@ -37,7 +38,18 @@ LAYERS = (
         "observed_gpu",
     ),
     ("descent", "volume", "volume_gpu", "scene_box"),
-    ("keyframes", "window", "trajectory", "pixel_bank", "draws", "pose_adam", "field_adam", "views", "saving"),
+    (
+        "keyframes",
+        "exposure",
+        "window",
+        "trajectory",
+        "pixel_bank",
+        "draws",
+        "pose_adam",
+        "field_adam",
+        "views",
+        "saving",
+    ),
     ("align", "tracker", "tracker_gpu"),
     (
         "mapper",

@@ -7,9 +7,10 @@ import pytest
 
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
+from ecslam.earlier import EVERY, KEPT, EarlierViews, around, cell_px, relief
 from ecslam.evaluation.trajectory import absolute_error
 from ecslam.messages import MOVING
-from ecslam.movers import EVERY, KEPT, Movers, around, cell_px, compare, grown, large, relief
+from ecslam.movers import compare, grown, large, without_movers
 from ecslam.slam import Slam
 from ecslam.types import Frame
 
@@ -32,17 +33,22 @@ def walked_through(frame: Frame, left: int, width: int = 40, depth_m: float = 0.
     )
 
 
-def remembering(frames: list[Frame]) -> tuple[Movers, np.ndarray]:
-    """Movers that remember these frames as keyframes, and the poses of these."""
-    movers = Movers(ROOM.intrinsics)
+def remembering(frames: list[Frame]) -> tuple[EarlierViews, np.ndarray]:
+    """What is remembered of these frames as keyframes, and the poses of these."""
+    earlier = EarlierViews()
     for number, frame in enumerate(frames):
-        movers.remember(frame, number)
-    return movers, np.stack([frame.c2w_gt for frame in frames])
+        earlier.remember(frame, number)
+    return earlier, np.stack([frame.c2w_gt for frame in frames])
+
+
+def left_of(frame: Frame, c2w: np.ndarray, earlier: EarlierViews, poses: np.ndarray) -> Frame:
+    """The frame, seen from about c2w, without what has come."""
+    return without_movers(frame, ROOM.intrinsics, c2w, earlier.asked, poses)
 
 
 def test_a_cell_has_the_nearest_depth_and_none_where_hardly_any_is_measured():
     depth = np.full((480, 640), 2, np.float32)
-    assert cell_px(depth) == 10
+    assert cell_px(640) == 10
     depth[105, 205], depth[200:210, 300:307], depth[300:310, 400:404] = 1, 0, 0
     cells = relief(depth)
     assert cells.shape == (48, 64)
@@ -116,17 +122,17 @@ def test_a_region_grows_as_far_as_its_surface_and_what_is_unknown():
 
 
 def test_a_room_at_rest_is_left_as_it_is():
-    movers, poses = remembering([ROOM[i] for i in range(0, 60, 5)])
+    earlier, poses = remembering([ROOM[i] for i in range(0, 60, 5)])
     for i in range(60, 75, 5):
         frame = ROOM[i]
-        assert movers.without(frame, ROOM[i - 1].c2w_gt, poses) is frame
+        assert left_of(frame, ROOM[i - 1].c2w_gt, earlier, poses) is frame
 
 
 def test_who_walks_through_is_left_out_and_the_rest_is_kept():
-    movers, poses = remembering([ROOM[i] for i in range(0, 30, 5)])
+    earlier, poses = remembering([ROOM[i] for i in range(0, 30, 5)])
     frame = walked_through(ROOM[30], 50)
     there = frame.depth != ROOM[30].depth
-    found = movers.without(frame, ROOM[29].c2w_gt, poses)
+    found = left_of(frame, ROOM[29].c2w_gt, earlier, poses)
     gone = (found.depth == 0) & (frame.depth > 0)
     assert gone[there].mean() > 0.97
     assert gone[~there].mean() < 0.06
@@ -135,36 +141,36 @@ def test_who_walks_through_is_left_out_and_the_rest_is_kept():
 
 
 def test_a_keyframe_made_with_what_moves_is_not_taken():
-    movers, poses = remembering([ROOM[i] for i in range(0, 30, 5)])
+    earlier, poses = remembering([ROOM[i] for i in range(0, 30, 5)])
     frame = replace(walked_through(ROOM[30], 50), keyframe="made before")
-    assert movers.without(frame, ROOM[29].c2w_gt, poses).keyframe is None
+    assert left_of(frame, ROOM[29].c2w_gt, earlier, poses).keyframe is None
 
 
 def test_a_picture_that_has_changed_all_over_is_seen_from_elsewhere():
-    movers, poses = remembering([ROOM[0]])
+    earlier, poses = remembering([ROOM[0]])
     frame = replace(ROOM[1], depth=np.full_like(ROOM[1].depth, 0.5))
-    assert movers.without(frame, ROOM[1].c2w_gt, poses) is frame
+    assert left_of(frame, ROOM[1].c2w_gt, earlier, poses) is frame
 
 
 def test_what_stays_belongs_to_the_room_in_the_end():
     before, with_it = ROOM[0], walked_through(ROOM[0], 50)
-    movers, poses = Movers(ROOM.intrinsics), np.tile(before.c2w_gt, (1 + 2 * KEPT, 1, 1))
-    movers.remember(before, 0)
+    earlier, poses = EarlierViews(), np.tile(before.c2w_gt, (1 + 2 * KEPT, 1, 1))
+    earlier.remember(before, 0)
     left_out = []
     for number in range(1, 2 * KEPT):
-        found = movers.without(with_it, before.c2w_gt, poses)
+        found = left_of(with_it, before.c2w_gt, earlier, poses)
         left_out.append(found is not with_it)
-        movers.remember(found, number)
+        earlier.remember(found, number)
     assert left_out[0]
     assert not any(left_out[KEPT:])
     assert sum(left_out) >= KEPT // EVERY
 
 
 def test_a_restored_one_goes_on_the_same():
-    movers, poses = remembering([ROOM[i] for i in range(0, 30, 5)])
-    other, frame = Movers(ROOM.intrinsics), walked_through(ROOM[30], 50)
-    other.load(movers.state())
-    one, two = (m.without(frame, ROOM[29].c2w_gt, poses).depth for m in (movers, other))
+    earlier, poses = remembering([ROOM[i] for i in range(0, 30, 5)])
+    other, frame = EarlierViews(), walked_through(ROOM[30], 50)
+    other.load(earlier.state())
+    one, two = (left_of(frame, ROOM[29].c2w_gt, e, poses).depth for e in (earlier, other))
     assert np.array_equal(one, two)
 
 

@@ -11,8 +11,8 @@ from ecslam.config import Config
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import Prefetch, open_sequence
 from ecslam.denoising import denoised
+from ecslam.earlier import relief, tint
 from ecslam.keyframes import make_keyframe
-from ecslam.movers import relief
 from ecslam.pixels import choose_pixels, feature_points, find_corners
 from ecslam.runtime import ahead
 from ecslam.runtime.ahead import preparation
@@ -28,13 +28,16 @@ def test_corners_are_found_ahead_for_the_frames_that_need_them(preset, found):
     assert [frame.index for frame in frames if frame.corners is not None] == list(found)
 
 
-@pytest.mark.parametrize("movers", ["true", "false"])
-def test_what_tells_movers_is_looked_at_ahead(movers):
-    config = apply_settings(load_preset("live"), [f"movers={movers}"])
+@pytest.mark.parametrize(("movers", "exposure"), [("true", "true"), ("false", "false"), ("true", "false")])
+def test_what_is_held_against_earlier_views_is_looked_at_ahead(movers, exposure):
+    config = apply_settings(load_preset("live"), [f"movers={movers}", f"exposure={exposure}"])
     prepared = preparation(lambda: config, ROOM.intrinsics, "cpu")(ROOM[1])
-    assert (prepared.relief is None) == (movers == "true")
+    assert (prepared.relief is None) == (movers == "true" and exposure == "false")
+    assert (prepared.tint is None) == (exposure == "false")
     if prepared.relief is not None:
         assert np.array_equal(prepared.relief, relief(prepared.depth))
+    if prepared.tint is not None:
+        assert np.array_equal(prepared.tint, tint(prepared.color), equal_nan=True)
 
 
 def test_other_depth_has_another_relief():

@@ -1,5 +1,5 @@
-"""The loops that hold a frame's depth against what earlier views saw (numba), in cells of a few pixels. What is
-worked out for every cell is laid out so that several of a row go at once: without branches, and in plain float32."""
+"""The loops that hold a frame against what earlier views saw (numba), in cells of a few pixels. What is worked out for
+every cell is laid out so that several of a row go at once: without branches, and in plain float32."""
 
 from __future__ import annotations
 
@@ -32,6 +32,28 @@ def nearest(depth, cell, inside, out):
             least[column] = least[column] if measured[column] > enough else zero
 
 
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def project(depths, v, lens, to_view, rows, index, ahead):
+    """Where a view [rows, columns] sees the cells of row ``v``: flat ``index``, -1 outside, and the depth ``ahead``."""
+    fx, fy, cx, cy = lens
+    m00, m01, m02, m03 = to_view[0]
+    m10, m11, m12, m13 = to_view[1]
+    m20, m21, m22, m23 = to_view[2]
+    columns = depths.size
+    zero, half, one, wide, high = np.float32(0), np.float32(0.5), np.float32(1), np.float32(columns), np.float32(rows)
+    down = (np.float32(v) - cy) * (one / fy)
+    for u in range(columns):
+        depth = depths[u]
+        a, b = (np.float32(u) - cx) * (one / fx) * depth, down * depth
+        z = m20 * a + m21 * b + m22 * depth + m23
+        column = (m00 * a + m01 * b + m02 * depth + m03) * (one / z) * fx + cx + half
+        row = (m10 * a + m11 * b + m12 * depth + m13) * (one / z) * fy + cy + half
+        inside = (depth > zero) & (z > zero)
+        inside &= (column >= zero) & (column < wide) & (row >= zero) & (row < high)
+        index[u] = np.int32(row) * np.int32(columns) + np.int32(column) if inside else np.int32(-1)
+        ahead[u] = z
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 def compare(near, lens, to_view, seen, front, came, settled):
     """Note which cells lie in front of what one of the views saw there, and which where one of them saw a surface.
@@ -41,32 +63,46 @@ def compare(near, lens, to_view, seen, front, came, settled):
     about each cell of a view. front: float32, metres and share of the depth by which something is nearer that lies in
     front. came, settled: bool [h, w], False before.
     """
-    fx, fy, cx, cy = lens
     rows, columns = near.shape
-    zero, half, one, wide, high = np.float32(0), np.float32(0.5), np.float32(1), np.float32(columns), np.float32(rows)
     index, ahead = np.empty(columns, np.int32), np.empty(columns, np.float32)
     for view in range(seen.shape[0]):
-        m00, m01, m02, m03 = to_view[view, 0]
-        m10, m11, m12, m13 = to_view[view, 1]
-        m20, m21, m22, m23 = to_view[view, 2]
         least, most = seen[view, 0].ravel(), seen[view, 1].ravel()
         for v in range(rows):
-            depths, down = near[v], (np.float32(v) - cy) * (one / fy)
-            for u in range(columns):
-                depth = depths[u]
-                a, b = (np.float32(u) - cx) * (one / fx) * depth, down * depth
-                z = m20 * a + m21 * b + m22 * depth + m23
-                column = (m00 * a + m01 * b + m02 * depth + m03) * (one / z) * fx + cx + half
-                row = (m10 * a + m11 * b + m12 * depth + m13) * (one / z) * fy + cy + half
-                inside = (depth > zero) & (z > zero)
-                inside &= (column >= zero) & (column < wide) & (row >= zero) & (row < high)
-                index[u] = np.int32(row) * np.int32(columns) + np.int32(column) if inside else np.int32(-1)
-                ahead[u] = z
+            project(near[v], v, lens, to_view[view], rows, index, ahead)
             for u in range(columns):
                 i = index[u]
-                if i >= 0 and least[i] > zero:
+                if i >= 0 and least[i] > np.float32(0):
                     margin = front[0] + front[1] * least[i]
                     if ahead[u] < least[i] - margin:
                         came[v, u] = True
                     elif ahead[u] < most[i] + margin:
                         settled[v, u] = True
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def ratios(near, tint, lens, to_view, seen, tints, within, every, stride, out):
+    """How much brighter views saw what a frame sees: fills ``out`` float32 [3, V * h * w] with logarithms of the ratios
+    of red, green and blue, and returns how many there are.
+
+    near, lens, to_view, seen: see ``compare``. tint: float32 [h, w, 3], logarithms of the cells' colours, NaN where
+    they tell nothing; tints: [V, h, w, 3], those of the views. within: float32, metres and share of the depth by which
+    what is one surface may differ. Every ``every``-th view is asked, about every ``stride``-th row and column of cells.
+    """
+    rows, columns = near.shape
+    index, ahead = np.empty(columns, np.int32), np.empty(columns, np.float32)
+    found = 0
+    for view in range(0, seen.shape[0], every):
+        least, most = seen[view, 0].ravel(), seen[view, 1].ravel()
+        theirs = tints[view].reshape(-1, 3)
+        for v in range(0, rows, stride):
+            project(near[v], v, lens, to_view[view], rows, index, ahead)
+            for u in range(0, columns, stride):
+                i = index[u]
+                if i >= 0 and least[i] > np.float32(0):
+                    margin = within[0] + within[1] * least[i]
+                    same = (ahead[u] > least[i] - margin) & (ahead[u] < most[i] + margin)
+                    if same and theirs[i, 0] - tint[v, u, 0] < np.float32(np.inf):
+                        for k in range(3):
+                            out[k, found] = theirs[i, k] - tint[v, u, k]
+                        found += 1
+    return found

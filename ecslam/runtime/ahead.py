@@ -12,22 +12,24 @@ from ..types import Frame, Intrinsics
 
 
 def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -> Callable[[Frame], Frame]:
-    """Smooth the depth of frames, look at its relief, find the corners of those that will need them, make keyframes of
-    those whose turn it will be, and put images for a GPU where it can fetch them by itself.
+    """Smooth the depth of frames, look at its relief and at their tint, find the corners of those that will need them,
+    make keyframes of those whose turn it will be, and put images for a GPU where it can fetch them by itself.
 
     config: asked for every frame. What is missing, or was found with other settings, is made good when it is needed.
     """
 
     def prepare(frame: Frame) -> Frame:
         from ..denoising import denoised  # torch is not imported at the start
+        from ..earlier import relief, tint
         from ..keyframes import prepared
-        from ..movers import relief
         from ..pixels import find_corners
 
         now = config()
         frame = denoised(frame, now)
-        if not now.movers:
+        if now.exposure or not now.movers:
             frame = replace(frame, relief=relief(frame.depth))
+        if now.exposure:
+            frame = replace(frame, tint=tint(frame.color))
         turn = frame.index % now.keyframe_every == 0
         if now.fus and (now.tracking.iterations > 0 or turn):
             frame = replace(frame, corners=find_corners(frame.color, now))

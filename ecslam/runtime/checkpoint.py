@@ -23,7 +23,7 @@ from ..atomic import write_atomic
 from ..types import InputError
 from .files import to_json
 
-VERSION = 7
+VERSION = 8
 GENERATIONS = 2
 MAX_MANIFEST_BYTES = 16 << 20
 LASTING = "keyframes."

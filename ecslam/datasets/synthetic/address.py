@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from dataclasses import dataclass, replace
+from typing import Any
 from urllib.parse import parse_qsl
 
 from ...types import InputError
@@ -12,14 +13,15 @@ ROOMS = ("studio", "apartment", "corridor")
 PREFIX = "synthetic/"
 MAX_SIDE, MAX_FRAMES = 4096, 100_000
 MOST_READOUT_S = 1 / 30
-SWITCH = {"0": False, "1": True}
-FORMS = "noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1"
+SWITCHES, SWITCH = ("noise", "visitor", "exposure"), {"0": False, "1": True}
+FORMS = "noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1, exposure=0|1"
 
 
 @dataclass(frozen=True)
 class Address:
     """Which room to render and how. frames: None for one round of the room's path. width, height: pixels. readout:
-    seconds from an image's first row to its last (a rolling shutter). visitor: whether somebody walks through."""
+    seconds from an image's first row to its last (a rolling shutter). visitor: whether somebody walks through.
+    exposure: whether each image is exposed for what it shows."""
 
     room: str
     width: int = 640
@@ -29,13 +31,13 @@ class Address:
     seed: int = 0
     readout: float = 0.0
     visitor: bool = False
+    exposure: bool = False
 
 
 def parse_address(address: str, defaults: Address | None = None) -> Address:
     """Read a room's name, with or without ``synthetic/`` and with options after ``?`` that override ``defaults``.
 
-    Options: noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1. Raises InputError for an unknown room,
-    an unknown option or a value out of range.
+    The options are in ``FORMS``. Raises InputError for an unknown room, an unknown option or a value out of range.
     """
     name, _, query = address.removeprefix(PREFIX).partition("?")
     if name not in ROOMS:
@@ -66,10 +68,9 @@ def check(address: Address) -> Address:
 
 def _apply(address: Address, key: str, value: str, source: str) -> Address:
     try:
-        if key == "noise":
-            return replace(address, noise=SWITCH[value])
-        if key == "visitor":
-            return replace(address, visitor=SWITCH[value])
+        if key in SWITCHES:
+            switched: dict[str, Any] = {key: SWITCH[value]}
+            return replace(address, **switched)
         if key == "frames":
             return replace(address, frames=int(value))
         if key == "seed":

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ...types import Frame, Intrinsics, Mesh
 from .address import PREFIX, Address, check, parse_address
+from .exposing import exposed
 from .lighting import bake
 from .mesh import reference_mesh
 from .noise import kinect
@@ -62,14 +63,15 @@ def open_synthetic(
     seed: int = 0,
     readout: float = 0.0,
     visitor: bool = False,
+    exposure: bool = False,
 ) -> SyntheticSequence:
     """Open a built-in room: ``studio``, ``apartment`` or ``corridor``, also as an address with options (see address).
 
     The camera's path is closed: ``frames`` beyond one round (the default) go round again. ``noise`` imitates a Kinect;
-    ``seed`` changes that noise and nothing else; ``readout``, ``visitor``: see ``Address``. Raises InputError for an
-    unknown room or values out of range.
+    ``seed`` changes that noise and nothing else; ``readout``, ``visitor``, ``exposure``: see ``Address``. Raises
+    InputError for an unknown room or values out of range.
     """
-    defaults = check(Address("studio", width, height, frames, noise, seed, readout, visitor))
+    defaults = check(Address("studio", width, height, frames, noise, seed, readout, visitor, exposure))
     return SyntheticSequence(parse_address(name, defaults))
 
 
@@ -103,6 +105,8 @@ class SyntheticSequence:
         feet = standing(index, self._round, room(self.address.room).interior[0, 2]) if self.address.visitor else None
         if feet is not None:
             color, depth = with_visitor(color, depth, self.intrinsics, c2w, feet)
+        if self.address.exposure:
+            color = exposed(color)
         if self.address.noise:
             color, depth = kinect(color, depth, self.intrinsics, np.random.default_rng([self.address.seed, index]))
         return Frame(index, index / RATE_HZ, color, depth, c2w.copy())

@@ -1,0 +1,108 @@
+"""What the last keyframes saw, in cells of a few pixels: whatever a new frame is held against."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .kernels import earlier_views
+from .types import Frame, Intrinsics
+
+COLUMNS, SAMPLES = 64, 4  # cells in a row of the image, and pixels of a cell's row or column whose depth is looked at
+KEPT, EVERY = 17, 2  # keyframes that are remembered, and each which of them is asked
+DARK, BRIGHT = 10.0, 245.0  # of 255: outside, a cell's mean says little about how bright its surface is
+
+Cells = NDArray[np.float32]
+
+
+class Views(NamedTuple):
+    """Earlier views, the newest first. seen: float32 [V, 2, h, w], see ``around``. tints: float32 [V, h, w, 3], see
+    ``tint``. keyframes: their numbers [V]."""
+
+    seen: NDArray[np.float32]
+    tints: NDArray[np.float32]
+    keyframes: list[int]
+
+
+class EarlierViews:
+    """Remembers what the last keyframes saw. The engine thread alone writes it."""
+
+    def __init__(self) -> None:
+        self._seen: list[NDArray[np.float32]] = []
+        self._tints: list[NDArray[np.float32]] = []
+        self._keyframes: list[int] = []
+        self._ask()
+
+    def _ask(self) -> None:
+        """Work out which of what is remembered is asked from now on."""
+        asked = range(len(self._seen))[::-EVERY]
+        seen, tints = (np.array([kept[i] for i in asked]) for kept in (self._seen, self._tints))
+        self.asked = Views(seen, tints, [self._keyframes[i] for i in asked])
+
+    def remember(self, frame: Frame, keyframe: int) -> None:
+        """Keep what a frame saw that is the keyframe number ``keyframe``."""
+        self._seen = [*self._seen, around(relief_of(frame))][-KEPT:]
+        self._tints = [*self._tints, tint_of(frame)][-KEPT:]
+        self._keyframes = [*self._keyframes, keyframe][-KEPT:]
+        self._ask()
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What ``load`` needs."""
+        seen, tints = (np.array(kept, np.float32) for kept in (self._seen, self._tints))
+        return {"seen": seen, "tints": tints, "keyframes": np.array(self._keyframes, np.int64)}
+
+    def load(self, state: dict[str, NDArray[Any]]) -> None:
+        """Go on from what ``state`` gave."""
+        self._seen, self._tints = list(state["seen"]), list(state["tints"])
+        self._keyframes = state["keyframes"].tolist()
+        self._ask()
+
+
+def relief_of(frame: Frame) -> Cells:
+    """A frame's relief, which somebody may have looked at already."""
+    return relief(frame.depth) if frame.relief is None else frame.relief
+
+
+def tint_of(frame: Frame) -> NDArray[np.float32]:
+    """A frame's tint, which somebody may have looked at already."""
+    return tint(frame.color) if frame.tint is None else frame.tint
+
+
+def cell_px(width: int) -> int:
+    """The side of a cell in pixels, of an image of that width."""
+    return max(1, round(width / COLUMNS))
+
+
+def cell_lens(camera: Intrinsics, cell: int) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a camera whose pixels are the cells."""
+    middle = (cell - 1) / 2
+    return camera.fx / cell, camera.fy / cell, (camera.cx - middle) / cell, (camera.cy - middle) / cell
+
+
+def relief(depth: NDArray[np.float32]) -> Cells:
+    """The nearest depth in each cell [h, w] of an image, 0 where less than half of the cell is measured."""
+    cell = cell_px(depth.shape[1])
+    inside = ((np.arange(SAMPLES) + 0.5) * cell / SAMPLES).astype(np.int64)
+    out = np.empty([side // cell for side in depth.shape], np.float32)
+    earlier_views.nearest(np.ascontiguousarray(depth, np.float32), cell, inside, out)
+    return out
+
+
+def tint(color: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The logarithm of the mean colour of each cell [h, w, 3] of an image; NaN where that is too dark or too bright."""
+    cell = cell_px(color.shape[1])
+    height, width = (side // cell for side in color.shape[:2])
+    mean = cv2.resize(color[: height * cell, : width * cell], (width, height), interpolation=cv2.INTER_AREA)
+    fair = ((mean >= DARK) & (mean <= BRIGHT)).all(2, keepdims=True)
+    return np.log(np.where(fair, mean, np.nan), dtype=np.float32)
+
+
+def around(seen: Cells) -> NDArray[np.float32]:
+    """The nearest and the farthest depth in and around each cell [2, h, w] of a view [h, w]; 0 where there is none in
+    it."""
+    square, known = np.ones((3, 3), np.uint8), seen > 0
+    nearest = cv2.erode(np.where(known, seen, np.float32(np.inf)), square)
+    return np.stack([np.where(known, nearest, np.float32(0)), cv2.dilate(seen, square)]).astype(np.float32)
