@@ -117,6 +117,8 @@ class ReplayEngine:
             self._playing = True
             self._go_to(0 if self._frame >= self.run.last else self._frame)
         elif isinstance(command, Step):
+            if self._frame == self.run.last:
+                raise InputError(f"frame {self._frame} is the last one; Play begins again")
             self._playing = False
             self._go_to(self._frame + 1)
         elif isinstance(command, RunTo):
@@ -153,7 +155,8 @@ class ReplayEngine:
     def _snapshot(self) -> Snapshot:
         run, frame, i = self.run, self._frame, int(self._rows[self._frame])
         row = run.rows[i]
-        state = State.TRACKING if self._playing else State.FINISHED if frame == run.last else State.PAUSED
+        end = State.FAILED if run.summary.get("ended") == "failed" else State.FINISHED
+        state = State.TRACKING if self._playing else end if frame == run.last else State.PAUSED
         trajectory = self._past.trajectory(i)
         keyframes = tuple(
             replace(k, c2w=trajectory[at]) for k, at in zip(run.keyframes, self._past.keyframes, strict=True) if at <= i
@@ -183,7 +186,7 @@ class ReplayEngine:
             loops=tuple(e for e in run.loops if e.frame <= frame),
             skipped=int(run.summary.get("skipped_frames") or 0),
             lost_frames=int(run.summary.get("lost_frames") or 0),
-            reason=self._problem,
+            reason=". ".join(filter(None, (run.incomplete, self._problem))),
         )
 
 

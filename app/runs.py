@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 class Run:
     """A finished run. sequence: its name, "" where that is not on record. rows: one dictionary for each frame that was
     not skipped, as in ``metrics.jsonl``; timestamps and both trajectories go with them; trajectory_gt: None without the
-    first true pose too, which put the map into its world. meshes: path by frame."""
+    first true pose too, which put the map into its world. meshes: path by frame. incomplete: why the run has not gone
+    to its sequence's end, or failed there, as a sentence; else ""."""
 
     folder: Path
     sequence: str
@@ -43,6 +44,7 @@ class Run:
     keyframes: tuple[KeyframeView, ...]
     loops: tuple[LoopEvent, ...]
     meshes: dict[int, Path]
+    incomplete: str
     fov_y_rad: float
     aspect: float
 
@@ -95,6 +97,7 @@ def load_run(folder: Path) -> Run:
         keyframes=_keyframes(folder, rows, trajectory),
         loops=tuple(_loop_event(e) for e in events),
         meshes=_meshes(folder, int(rows[-1]["frame"])),
+        incomplete=_incomplete(summary, int(rows[-1]["frame"]) + 1, about.get("frames_total")),
         fov_y_rad=float(2 * np.arctan(height / 2 / fy)),
         aspect=width / height,
     )
@@ -121,6 +124,16 @@ def notices_in(folder: Path) -> list[Notice]:
 def drawable_mesh(path: Path) -> Mesh:
     """A mesh file within the triangle budget; remembered, as scrubbing comes back to it. Raises InputError."""
     return simplify(load_mesh(path))
+
+
+def _incomplete(summary: dict[str, Any], frames: int, total: Any) -> str:
+    done = f"{frames} of {total} frames" if isinstance(total, int) else f"{frames} frames"
+    ended = summary.get("ended", "finished" if summary else "interrupted")
+    if ended == "failed":
+        return f"Failed after {done}: {summary.get('error')}"
+    if ended == "interrupted":
+        return f"Not finished: {done} are done; ecslam resume goes on with it"
+    return f"Stopped after {done}" if ended == "stopped" else ""
 
 
 def _number(value: Any, usual: float) -> float:

@@ -353,9 +353,13 @@ def test_a_finished_run_shows_its_notices(tmp_path):
     run = write_run(tmp_path / "a", 30)
     with (run / "events.jsonl").open("a") as log:
         log.write('{"type":"notice","level":"warning","text":"lost","frame":7}\n')
+        log.write('{"type":"notice","level":"error","text":"no memory","frame":null}\n')
+    (run / "summary.json").write_text('{"ended":"failed","error":"no memory"}')
     page = server.view([run], port=0)
+    html = next(p for p in page.hub.panels if isinstance(p, Notices))._html
     try:
-        assert "Frame 7: lost" in next(p for p in page.hub.panels if isinstance(p, Notices))._html.content
+        assert until(lambda: "no memory" not in html.content), "the status card says it"
+        assert "Frame 7: lost" in html.content
     finally:
         page.close()
 

@@ -163,6 +163,7 @@ def test_play_runs_to_the_end_and_step_moves_by_one(replay):
     events(replay, m.Snapshot, m.Resume())
     assert until(lambda: replay.latest().state is m.State.FINISHED)
     assert replay.latest().frame == FRAMES - 1
+    assert events(replay, m.Snapshot, m.Step())[1].error == f"frame {FRAMES - 1} is the last one; Play begins again"
 
 
 @pytest.mark.parametrize("command", [m.Restart(), m.Tune("mapping.rays", 3), m.Export("mesh", "exe"), m.Export("soul")])
@@ -204,6 +205,30 @@ def test_killed_run_with_a_cut_line_opens(folder, tmp_path):
     run = load_run(tmp_path)
     assert len(run.rows) == FRAMES - 1
     assert (run.trajectory_gt, run.loops, run.meshes) == (None, (), {})
+
+
+@pytest.mark.parametrize(
+    ("summary", "state", "says"),
+    [
+        ({"ended": "finished"}, m.State.FINISHED, ""),
+        ({"frames": FRAMES}, m.State.FINISHED, ""),
+        ({"ended": "stopped"}, m.State.FINISHED, f"Stopped after {FRAMES} of 90 frames"),
+        ({"ended": "failed", "error": "no memory"}, m.State.FAILED, f"Failed after {FRAMES} of 90 frames: no memory"),
+        ({"ended": "interrupted"}, m.State.FINISHED, f"Not finished: {FRAMES} of 90 frames are done; ecslam resume"),
+        ({}, m.State.FINISHED, f"Not finished: {FRAMES} of 90 frames are done; ecslam resume"),
+    ],
+)
+def test_a_replay_says_how_its_run_ended(folder, tmp_path, summary, state, says):
+    shutil.copytree(folder, tmp_path / "run")
+    (tmp_path / "run/summary.json").write_text(json.dumps(summary))
+    (tmp_path / "run/run.json").write_text(json.dumps({"frames_total": 90}))
+    replay = ReplayEngine(load_run(tmp_path / "run"))
+    try:
+        assert replay.latest().state is state
+        assert replay.latest().reason.startswith(says)
+        assert bool(replay.latest().reason) == bool(says)
+    finally:
+        replay.close()
 
 
 def test_lines_and_values_of_wrong_types_are_left_out(folder, tmp_path):

@@ -27,7 +27,7 @@ from ecslam.runtime.tally import Tally
 from ecslam.types import InputError
 
 SUMMARY_KEYS = """
-    sequence preset device kernels seed frames keyframes wall_s setup_s fps_wall fps_engine
+    sequence preset ended error device kernels seed frames keyframes wall_s setup_s fps_wall fps_engine
     ate_rmse_cm ate_mean_cm ate_max_cm parameters parameters_mb peak_memory_mb skipped_frames lost_frames loop_closures
     kernels_note unreadable_frames frames_without_ground_truth warnings export_s not_saved
 """
@@ -69,6 +69,7 @@ def test_the_run_folder_is_complete(tmp_path):
 
 def test_the_figures_are_what_they_say(tmp_path):
     summary = run(tmp_path, behaviour=Behaviour(lost=(7, 8), loop_at=20))
+    assert (summary["ended"], summary["error"]) == ("finished", "")
     assert (summary["frames"], summary["keyframes"], summary["loop_closures"], summary["lost_frames"]) == (30, 6, 1, 2)
     assert summary["fps_engine"] == pytest.approx(1e3 / 5)  # 2 + 3 ms a frame, the first one's 100 ms left out
     assert 30 / summary["fps_wall"] == pytest.approx(summary["wall_s"], abs=1e-3)  # rounded to milliseconds
@@ -189,6 +190,7 @@ def test_a_run_that_skipped_repeated_times_is_judged(tmp_path):
 def test_a_run_stopped_early_is_judged_by_what_it_did(tmp_path):
     with running(tmp_path, paused_at=12) as (handle, watch, _):
         watch.go(Stop(), State.FINISHED)
+    assert handle.summary["ended"] == "stopped"
     assert judge_run(tmp_path)["ate_rmse_cm"] == pytest.approx(handle.summary["ate_rmse_cm"])
 
 
@@ -268,6 +270,7 @@ def test_a_failure_in_the_engine_proper_is_told_and_keeps_the_poses(tmp_path):
     with running(tmp_path, behaviour=Behaviour(fail_at=8)) as (handle, watch, _):
         assert watch.state(State.FAILED).reason == "the map exploded"
         assert isinstance(handle.error, RuntimeError)
+    assert (handle.summary["ended"], handle.summary["error"]) == ("failed", "the map exploded")
     assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 8
     with pytest.raises(RuntimeError, match="exploded"):
         run(tmp_path, behaviour=Behaviour(fail_at=8))
@@ -443,7 +446,7 @@ def test_resume_drops_the_mesh_and_the_picture_of_the_frames_before(tmp_path):
         (tmp_path / name).write_text("of 12 frames")
     resumed = Engine.resume(tmp_path, sequence=FakeSequence(30), make=maker())
     resumed.submit(Quit())
-    resumed.run()
+    assert resumed.run()["ended"] == "interrupted"
     assert not any((tmp_path / name).exists() for name in ("mesh.ply", "picture.png"))
 
 

@@ -15,6 +15,7 @@ from ..runs import Run, drawable_mesh
 
 _FIGURES = (
     ("preset", "preset", None),
+    ("ended", "ended", None),
     ("ate_rmse_cm", "ATE RMSE, cm", 2),
     ("ate_max_cm", "ATE max, cm", 2),
     ("fps_wall", "frames/s, wall", 1),

@@ -9,7 +9,7 @@ from ecslam.messages import Pause, Resume, State, Step
 from ..hub import Hub
 from ..panel import BasePanel
 
-HALTED = (State.PAUSED, State.FINISHED)
+HALTED = (State.PAUSED, State.FINISHED, State.FAILED)
 
 
 class Panel(BasePanel):

@@ -55,7 +55,7 @@ class Panel(BasePanel):
         notes = [
             theme.note(_words(n), _COLORS.get(n.level, theme.KEYFRAME))
             for n in reversed(self._newest)
-            if n.text != self._said
+            if not self._said.endswith(n.text)
         ]
         earlier = self._count - len(self._newest)
         if not notes and not earlier:

@@ -219,7 +219,7 @@ class Engine:
         patience.cancel()
         self._control.end()
         try:
-            self._finish(run, turn is Turn.STOP and self.error is None)
+            self._finish(run, turn)
         except Exception as error:
             self._failed(error)
         if self.error is not None:
@@ -228,10 +228,10 @@ class Engine:
             self._show(State.FINISHED)
         return turn
 
-    def _finish(self, run: Run, complete: bool) -> None:
+    def _finish(self, run: Run, turn: Turn) -> None:
         """Final poses, mesh, summary; an incomplete run ends without the last mapping and without the mesh, one whose
         last mapping fails without the mesh."""
-        export_s = 0.0
+        complete, export_s = turn is Turn.STOP and self.error is None, 0.0
         try:
             run.end(complete, self._interrupt(run, lambda: self._control.leaving))
             if complete:
@@ -240,7 +240,14 @@ class Engine:
                 export_s = monotonic() - began
         except Exception as error:
             self._failed(error)
-        self.summary = run.close(export_s)
+        self.summary = run.close(self._ended(run, turn), words(self.error) if self.error else "", export_s)
+
+    def _ended(self, run: Run, turn: Turn) -> str:
+        if self.error is not None:
+            return "failed"
+        if turn is Turn.STOP and run.tally.position < len(run.plan.sequence):
+            return "stopped"
+        return "finished" if turn is Turn.STOP and not run.torn else "interrupted"
 
     def _frames(self, run: Run, frames: Items) -> Turn:
         """Step through the frames as the commands want it; what ended that (STOP also at the sequence's end)."""

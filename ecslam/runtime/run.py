@@ -371,10 +371,11 @@ class Run:
 
         return counted
 
-    def close(self, export_s: float) -> dict[str, Any]:
+    def close(self, ended: str, error: str, export_s: float) -> dict[str, Any]:
         """Write ``summary.json`` and close the logs; the summary comes back, and says too where that failed. ``end``
-        has been called before."""
-        summary = summarise(self, export_s)
+        has been called before. ended: ``finished``, ``stopped`` before its last frame, ``interrupted`` (``resume`` can
+        go on) or ``failed``, with error as the reason."""
+        summary = summarise(self, ended, error, export_s)
         self.folder.write("summary.json", summary)
         self.folder.close()
         return summary | {"not_saved": dict(self.folder.not_saved)}

@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from .run import Run
 
 
-def summarise(run: Run, export_s: float) -> dict[str, Any]:
-    """Plain values. fps_wall counts everything until the poses are final; export_s: seconds for meshes after that.
+def summarise(run: Run, ended: str, error: str, export_s: float) -> dict[str, Any]:
+    """Plain values. ended, error: see ``Run.close``; fps_wall counts everything until the poses are final; export_s:
+    seconds for meshes after that.
 
     ``ecslam eval`` adds the figures that need a reference mesh.
     """
@@ -20,6 +21,8 @@ def summarise(run: Run, export_s: float) -> dict[str, Any]:
     return {
         "sequence": run.plan.sequence.name,
         "preset": run.config.preset,
+        "ended": ended,
+        "error": error,
         "device": run.plan.device,
         "kernels": slam.kernels_name if slam else None,
         "kernels_note": slam.kernels_note if slam else "",
