@@ -178,7 +178,7 @@ def test_the_controls_begin_with_what_the_run_was_given(tmp_path):
     engine._preset = "live"
     page = server.start(engine.skip_to(3), port=0)
     try:
-        wanted = {"Seed": 7, "Schedule": "overlap", "Tracking iterations": 0, "Mapping iterations": 23}
+        wanted = {"Seed": 7, "Schedule": "overlap", "Tracking": 0, "Mapping": 23}
         for label, value in wanted.items():
             assert until(lambda label=label, value=value: control(page, label)[1].value == value), label
     finally:
@@ -189,13 +189,13 @@ def test_a_restart_takes_back_what_was_tuned(tmp_path):
     engine = Engine(QUICK, FakeSequence(400), tmp_path / "run", make=maker())
     engine.submit(m.SpeedLimit(20.0))
     page = server.start(engine, port=0)
-    slider = control(page, "Mapping iterations")[1]
+    slider = control(page, "Mapping")[1]
     engine.start()
     try:
         for again in (m.Restart(), m.LoadPreset(QUICK.preset)):
             assert until(lambda: page.hub.current is not None and page.hub.current.frame in range(3, 60))
             with viewing(page) as client:
-                press(page, client, "Mapping iterations", 33)
+                press(page, client, "Mapping", 33)
                 assert until(lambda: engine._control.config.mapping.iterations == 33)
             engine.submit(again)
             assert until(lambda: slider.value == engine._control.config.mapping.iterations != 33), again
@@ -393,7 +393,7 @@ def test_the_space_key_pauses_a_run_and_lets_it_go_on(page, engine):
 @pytest.mark.parametrize("end", [m.State.FINISHED, m.State.FAILED])
 def test_a_run_that_is_over_offers_no_steering_until_a_restart(engine, page, end):
     def usable():
-        labels = ("Frame", "Run to frame", "Go on with this preset", "Mapping iterations", "Tracking iterations")
+        labels = ("Frame", "Run to frame", "Go on with this preset", "Mapping", "Tracking")
         return {control(page, "Run")[1].visible, *(not control(page, label)[1].disabled for label in labels)}
 
     s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)
@@ -541,10 +541,10 @@ def test_controls_answer_at_once_while_the_page_is_busy(page, engine):
     ("label", "value", "command"),
     [
         ("Run", "Step", m.Step()), ("Run to frame", True, m.RunTo(0)),
-        ("Limit (frames/s)", 12, m.SpeedLimit(12.0)), ("Pause on loop closure", True, m.PauseOnLoop(True)),
+        ("Limit (frames/s)", 12, m.SpeedLimit(12.0)), ("Pause on loops", True, m.PauseOnLoop(True)),
         ("Restart", True, m.Restart("synthetic/studio", "lite", 0, "strict")),
         ("Go on with this preset", True, m.LoadPreset("lite")),
-        ("Mapping iterations", 33, m.Tune("mapping.iterations", 33)),
+        ("Mapping", 33, m.Tune("mapping.iterations", 33)),
         ("Export mesh", True, m.Export("mesh", "ply", 0.02)),
         ("Export trajectory", True, m.Export("trajectory", "tum")),
         ("Export keyframes", True, m.Export("keyframes")), ("Export run as zip", True, m.Export("run", "zip")),
@@ -570,13 +570,19 @@ def test_the_mesh_mode_in_force_is_marked(replay_page):
     assert mode.value == "Wireframe"
 
 
+def test_every_label_fits_into_one_line(page, replay_page):
+    for shown in (page, replay_page):
+        for handle in shown.hub.server.gui._gui_input_handle_from_uuid.values():
+            assert isinstance(handle, viser.GuiButtonHandle) or len(handle.label) <= 16, handle.label
+
+
 def test_the_voxel_size_of_a_mesh_is_asked_for_only_where_one_is_made(page, replay_page):
     assert control(page, "Voxel size (cm)")[1].visible
     assert not control(replay_page, "Voxel size (cm)")[1].visible
 
 
 def test_live_only_controls_are_absent_from_a_replay(replay_page):
-    for label in ("Run", "Restart", "Mapping iterations", "Pause on loop closure"):
+    for label in ("Run", "Restart", "Mapping", "Pause on loops"):
         with pytest.raises(KeyError):
             control(replay_page, label)
 

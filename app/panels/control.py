@@ -149,12 +149,12 @@ class Panel(BasePanel):
 
     def _live_parameters(self) -> None:
         gui = self.hub.server.gui
-        with gui.add_folder("Live parameters", expand_by_default=False):
+        with gui.add_folder("Iterations", expand_by_default=False):
             self._iterations = {
-                key: gui.add_slider(label, fewest, 60, 1, 10)
-                for key, label, fewest in (
-                    ("tracking.iterations", "Tracking iterations", 0),
-                    ("mapping.iterations", "Mapping iterations", 1),
+                key: gui.add_slider(label, fewest, 60, 1, 10, hint=hint)
+                for key, label, fewest, hint in (
+                    ("tracking.iterations", "Tracking", 0, "Of each frame's pose, from the next frame on"),
+                    ("mapping.iterations", "Mapping", 1, "Of each mapping, from the next one on"),
                 )
             }
         for key, slider in self._iterations.items():

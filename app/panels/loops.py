@@ -37,7 +37,7 @@ class Panel(BasePanel):
         colors = [("links", theme.LOOP), ("before", theme.BEFORE), ("after", theme.ESTIMATE), ("window", theme.WINDOW)]
         self._legend = gui.add_html(theme.card(theme.legend(colors)), visible=False)
         if hub.replay is None:
-            pause = gui.add_checkbox("Pause on loop closure", False)
+            pause = gui.add_checkbox("Pause on loops", False, hint="Pause whenever a loop has closed")
             hub.on(pause, lambda event: hub.submit(PauseOnLoop(bool(pause.value)), event.client))
 
     def snapshot(self, s: Snapshot) -> None:

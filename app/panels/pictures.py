@@ -15,6 +15,7 @@ from ..hub import Hub
 from ..panel import BasePanel
 
 LEAST_S, MOST_S = 3.0, 20.0  # between two requests; the first pictures compile what renders them, and say little
+LIVE = "Pictures of the newest frame while the run goes on"
 BACK = "Where the run is, after a keyframe that was clicked"
 SHARE = 0.03  # of the engine's time
 _ORDER = (
@@ -39,7 +40,7 @@ class Panel(BasePanel):
         self._asked, self._asked_frame, self._keyframe = 0.0, -1, False
         self._pause_s = LEAST_S
         if hub.replay is None:
-            self._live = gui.add_checkbox("Refresh while running", True)
+            self._live = gui.add_checkbox("Live", True, hint=LIVE)
             hub.on(gui.add_button("Show current frame", color="gray", hint=BACK), self._show_current)
 
     def snapshot(self, s: Snapshot) -> None:
