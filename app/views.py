@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,6 +48,8 @@ class Views:
     def __init__(self, server: viser.ViserServer, scene: Scene) -> None:
         self._server, self._scene, self.walls = server, scene, WallGrids(server)
         self._framed: dict[int, _Framing] = {}
+        self._flights: dict[int, object] = {}
+        self._placing = threading.Lock()
         self._points = scene.points
         self._places: dict[float, tuple[Array, Array]] = {}
 
@@ -75,6 +78,7 @@ class Views:
         """The map has grown: move along the viewers that have left their camera to the page."""
         clients = self._server.get_clients()
         self._framed = {k: framing for k, framing in self._framed.items() if k in clients}
+        self._flights = {k: flight for k, flight in self._flights.items() if k in clients}
         for number, framing in list(self._framed.items()):
             client, distance = clients[number], np.linalg.norm(framing.position - framing.look_at)
             if framing.left(client):
@@ -126,7 +130,7 @@ class Views:
         place = behind(c2w, self._scene.up)
         way = self._way(client, place[0], REMEMBERED_BEHIND)
         self._framed[client.client_id] = _Framing(*place, way, follows=True)
-        self._place(client, *place)
+        self._place(client, self._depart(client), *place)
 
     def move_along(self, c2w: Array) -> None:
         """The run's camera has moved: so do the viewers that follow it."""
@@ -165,6 +169,7 @@ class Views:
         self, client: viser.ClientHandle, position: Array, look_at: Array, seconds: float, fov: float = FOV_RAD
     ) -> None:
         start = np.array(client.camera.position), np.array(client.camera.look_at), client.camera.fov
+        flight = self._depart(client)
 
         async def glide() -> None:
             steps = max(1, int(GLIDE_STEPS_PER_S * seconds))
@@ -175,6 +180,7 @@ class Views:
                 ease = t * t * (3 - 2 * t)
                 self._place(
                     client,
+                    flight,
                     start[0] + ease * (position - start[0]),
                     start[1] + ease * (look_at - start[1]),
                     start[2] + ease * (fov - start[2]),
@@ -183,9 +189,18 @@ class Views:
 
         asyncio.run_coroutine_threadsafe(glide(), self._server.get_event_loop())
 
-    def _place(self, client: viser.ClientHandle, position: Array, look_at: Array, fov: float = FOV_RAD) -> None:
-        with client.atomic():
-            client.camera.up_direction = self._scene.up
-            client.camera.fov = fov
-            client.camera.position = position
-            client.camera.look_at = look_at
+    def _depart(self, client: viser.ClientHandle) -> object:
+        """Begin a flight; it ends the one that the viewer is on."""
+        with self._placing:
+            self._flights[client.client_id] = flight = object()
+        return flight
+
+    def _place(
+        self, client: viser.ClientHandle, flight: object, position: Array, look_at: Array, fov: float = FOV_RAD
+    ) -> None:
+        with self._placing, client.atomic():
+            if self._flights.get(client.client_id) is flight:
+                client.camera.up_direction = self._scene.up
+                client.camera.fov = fov
+                client.camera.position = position
+                client.camera.look_at = look_at

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import numpy as np
 import pytest
 from ecslam_app import server, views
@@ -121,6 +123,22 @@ def test_flying_to_a_keyframe_ends_the_framing(page, viewer):
     assert until(lambda: np.linalg.norm(client.camera.position) < 1)
     grow(page, 2)
     assert np.linalg.norm(client.camera.position) < 1
+
+
+def test_a_flight_ends_the_one_before(page, viewer):
+    _, client = viewer
+    views, loop = page.hub.views, page.hub.server.get_event_loop()
+    places = []
+
+    def fly():
+        views.show_all(client, 0.3)
+        views.visit(client, np.eye(4))
+        places.append(behind(np.eye(4), page.hub.scene.up, 0.45)[0])
+
+    page.hub.post(fly)
+    assert until(lambda: places and np.allclose(client.camera.position, places[0]))
+    asyncio.run_coroutine_threadsafe(asyncio.sleep(0.5), loop).result()
+    assert np.allclose(client.camera.position, places[0])
 
 
 def test_who_follows_the_camera_goes_along_until_he_moves(page, viewer):
