@@ -193,7 +193,7 @@ def test_a_restart_takes_back_what_was_tuned(tmp_path):
     engine.start()
     try:
         for again in (m.Restart(), m.LoadPreset(QUICK.preset)):
-            assert until(lambda: page.hub.current is not None and page.hub.current.frame in range(3, 60))
+            assert until(lambda: page.hub.current is not None and page.hub.current.frame >= 3)
             with viewing(page) as client:
                 press(page, client, "Mapping", 33)
                 assert until(lambda: engine._control.config.mapping.iterations == 33)
