@@ -46,11 +46,18 @@ _TAP = (
 )
 # viser's page tries its socket anew every second while the server is away. After some failures a browser holds each
 # try back for longer than that, and the page never returns: let one through only when the server answers, and wait.
+# Until then say what is the matter.
+_AWAY = (
+    "No connection: the program behind this page has ended or cannot be reached. Once it is back, the page goes on by "
+    "itself."
+)
+_OTHER_TOKEN = "The program behind this page was started anew: open the address that its terminal printed."
 _RETURN = (
-    "let trying=false;const post=Worker.prototype.postMessage;"
+    "let trying=false;const post=Worker.prototype.postMessage,told=document.documentElement.dataset;"
     "Worker.prototype.postMessage=function(message,...rest){const send=()=>post.call(this,message,...rest);"
-    "if(message?.type!=='retry')send();else if(!trying){trying=true;fetch('/up',{cache:'no-store'})"
-    ".then(()=>{send();setTimeout(()=>trying=false,4000)},()=>trying=false)}}"
+    "if(message?.type!=='retry')send();else if(!trying){trying=true;fetch('/up',{cache:'no-store'}).then(answer=>{"
+    f"if(answer.status===401)told.away={_OTHER_TOKEN!r};else{{delete told.away;send()}}"
+    f"setTimeout(()=>trying=false,4000)}},()=>{{told.away={_AWAY!r};trying=false}})}}}}"
 )
 
 

@@ -92,6 +92,9 @@ STYLE = """
 .ec-six img{width:100%;display:block}
 .ec-six figcaption{position:absolute;left:5px;bottom:4px;font-size:10px;padding:0 6px;border-radius:9px;color:#fff;
   background:#0009}
+[data-away]::after{content:attr(data-away);position:fixed;z-index:999;left:16px;top:16px;max-width:min(30em,80vw);
+  padding:10px 14px;border-radius:8px;background:rgb(153,27,27);color:#fff;font-size:14px;line-height:1.45;
+  font-family:system-ui,sans-serif}
 @media (max-width:48em){.ec-grid{gap:4px}.ec-cell{padding:2px 7px 1px}.ec-cell b{font-size:13.5px;line-height:1.2}}
 """
 

@@ -405,13 +405,19 @@ def test_page_comes_back_when_the_server_does(tmp_path, browser):
     dashboard = server.start(engine, port=0)
     visit = Visit(browser, dashboard, 600, 400)
     dashboard.close()
+    away = "document.documentElement.dataset.away || ''"
+    visit.wait(lambda: visit.page.evaluate(away).startswith("No connection"))
     for _ in range(60):  # as many failures as a minute brings: from now on the browser holds each try back for seconds
         visit.page.evaluate("void new WebSocket(location.origin.replace('http', 'ws'))")
     visit.page.wait_for_timeout(8000)
+    dashboard = server.start(engine, port=dashboard.port, token="a-token-of-some-length")
+    visit.wait(lambda: "open the address" in visit.page.evaluate(away), 20)
+    dashboard.close()
     engine.skip_to(30)
     dashboard = server.start(engine, port=dashboard.port)
     try:
         visit.wait(lambda: visit.frame == 30, 20)
+        assert not visit.page.evaluate(away)
     finally:
         visit.page.close()
         dashboard.close()
