@@ -16,6 +16,7 @@ BEFORE: RGB = (239, 68, 68)
 OTHER: RGB = (20, 184, 166)
 MEASURE: RGB = (124, 58, 237)
 ACCENT: RGB = (234, 88, 12)
+NONE = "–"
 GRID: tuple[RGB, RGB] = (198, 206, 216), (58, 64, 74)  # light, dark
 
 STATE_COLORS: dict[str, RGB] = {
@@ -105,7 +106,8 @@ def chip(text: str, color: RGB) -> str:
 
 
 def cell(value: str, unit: str, label: str) -> str:
-    """One figure with its unit and name."""
+    """One figure with its unit and name; where there is none, a dash has no unit."""
+    unit = "" if value == NONE else unit
     return f'<div class="ec-cell"><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(label)}</span></div>'
 
 
@@ -127,7 +129,7 @@ def legend(entries: list[tuple[str, RGB]]) -> str:
 
 def number(value: float | None, digits: int = 2) -> str:
     """A figure for people; a dash where there is none."""
-    return "–" if value is None or value != value else f"{value:.{digits}f}"
+    return NONE if value is None or value != value else f"{value:.{digits}f}"
 
 
 def size(count: int) -> str:

@@ -323,6 +323,18 @@ def test_notices_stay_on_the_page_until_a_restart(engine, page):
     assert until(lambda: not html.visible)
 
 
+def test_that_a_run_prepares_is_no_notice_once_it_has_begun(engine, page):
+    html = next(p for p in page.hub.panels if isinstance(p, Notices))._html
+    engine._feed.publish(replace(engine.snapshot(), reported=None))
+    engine._feed.publish(m.Notice("info", "Preparing: kernels"))
+    engine._feed.publish(m.Notice("info", "relocalised", 3))
+    assert until(lambda: "relocalised" in html.content)
+    assert "Preparing" in html.content
+    engine.skip_to(4)
+    assert until(lambda: "Preparing" not in html.content)
+    assert "Frame 3: relocalised" in html.content
+
+
 def test_a_notice_names_its_frame_once(engine, page):
     html = next(p for p in page.hub.panels if isinstance(p, Notices))._html
     engine._feed.publish(m.Notice("info", "preset lite from frame 41 on", 41))
@@ -515,6 +527,13 @@ def test_only_frames_that_were_missed_are_counted(engine, skipped, lost, says):
     html = render(replace(engine.snapshot(), skipped=skipped, lost_frames=lost), "")
     assert says in html
     assert "0 frames" not in html
+
+
+def test_where_there_is_no_figure_there_is_a_dash_without_a_unit(engine):
+    none = {"fps_wall": 0.0, "fps_engine": 0.0, "ate_cm": None, "track_ms": 0.0, "map_ms": 0.0, "memory_mb": 0.0}
+    html = render(replace(engine.snapshot(), preset="", **none), "")
+    assert html.count("<b>–<small></small></b>") == len(none)
+    assert ">synthetic/studio</span>" in html
 
 
 def test_a_replay_plays_and_does_not_track(replay_page):

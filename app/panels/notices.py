@@ -30,7 +30,12 @@ class Panel(BasePanel):
         self._show()
 
     def snapshot(self, s: Snapshot) -> None:
-        if s.reason != self._said:
+        """What is going on before the first frame is done is no news any more after that."""
+        over = [n for n in self._newest if s.reported is not None and n.level == "info" and n.frame is None]
+        for notice in over:
+            self._newest.remove(notice)
+        self._count -= len(over)
+        if over or s.reason != self._said:
             self._said = s.reason
             self._show()
 

@@ -149,7 +149,7 @@ def _line(name: str, index: int) -> uplot.Series:
 
 def _dots(name: str) -> uplot.Series:
     color = theme.css(theme.LOOP)
-    points = uplot.Series_Points(show=True, size=11, fill=color, stroke="white", width=2)
+    points = uplot.Series_Points(show=True, size=9, fill=color, stroke=color, width=2)
     return uplot.Series(label=name, stroke=color, width=0, points=points)
 
 

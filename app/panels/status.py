@@ -79,16 +79,16 @@ def render(s: Snapshot | None, coming: str) -> str:
     cells = [
         theme.cell(theme.number(s.fps_wall or None, 1), "/s", "frames, wall clock"),
         theme.cell(theme.number(s.fps_engine or None, 1), "/s", "frames, engine"),
-        theme.cell(theme.number(s.ate_cm), "cm" if s.ate_cm is not None else "", "ATE so far"),
+        theme.cell(theme.number(s.ate_cm), "cm", "ATE so far"),
         theme.cell(theme.number(s.track_ms or None, 0), "ms", "tracking"),
         theme.cell(theme.number(s.map_ms or None, 0), "ms", "mapping"),
-        theme.cell(theme.number(s.memory_mb, 0), "MB", "memory"),
+        theme.cell(theme.number(s.memory_mb or None, 0), "MB", "memory"),
         theme.cell(str(len(s.keyframes)), "", "keyframes"),
         theme.cell(str(len(s.window)), "", "in BA window"),
         theme.cell(str(len(s.loops)), "", "loops closed"),
     ]
     lines = [line for line in _LINES.items() if line[0] != "ground truth" or s.trajectory_gt is not None]
-    name = f"{escape(s.sequence)} · {escape(s.preset)}"
+    name = escape(" · ".join(filter(None, (s.sequence, s.preset))))
     notes = [theme.note(s.reason, color)] if s.reason else []
     missed = [_count(n, what) for n, what in ((s.skipped, "skipped"), (s.lost_frames, "lost")) if n]
     if missed:
