@@ -62,7 +62,7 @@ STYLE = """
   color:var(--mantine-color-text);padding:4px 8px 6px;
   font-variant-numeric:tabular-nums}
 .ec b{font-weight:600}
-.ec .dim{color:var(--dim)}
+.ec .dim{color:var(--dim);overflow-wrap:anywhere}
 .ec-head{display:flex;align-items:center;gap:8px;margin-bottom:7px;min-width:0}
 .ec-chip{display:inline-flex;align-items:center;gap:6px;padding:2px 10px 2px 8px;border-radius:999px;font-weight:600;
   font-size:12px;white-space:nowrap;color:color-mix(in srgb,var(--c) 55%,var(--mantine-color-text));

@@ -13,6 +13,7 @@ import pytest
 import viser
 from ecslam_app import server, theme
 from ecslam_app.panel import TABS, BasePanel, find_panels
+from ecslam_app.panels.export import Panel as Export
 from ecslam_app.panels.loops import Panel as Loops
 from ecslam_app.panels.notices import Panel as Notices
 from ecslam_app.panels.status import WORDS, render
@@ -275,9 +276,8 @@ def test_loops_are_offered_only_once_there_are_any(replay_page):
 def test_a_replay_scrubbed_back_says_what_its_exports_are_of(replay_page):
     note = next(p for p in replay_page.hub.panels if p.tab == "Export")._whole
     replay_page.engine.submit(m.RunTo(20))
-    assert until(lambda: note.visible)
+    assert until(lambda: note.visible and "frame 20." in note.content)
     assert "frames 0 to 29" in note.content
-    assert "frame 20." in note.content
     replay_page.engine.submit(m.RunTo(29))
     assert until(lambda: not note.visible)
 
@@ -321,6 +321,16 @@ def test_notices_stay_on_the_page_until_a_restart(engine, page):
     assert "and 5 before these, in events.jsonl" in html.content
     engine.start().submit(m.Restart())
     assert until(lambda: not html.visible)
+
+
+def test_the_page_says_where_the_run_lies(engine, page, tmp_path):
+    html = next(p for p in page.hub.panels if isinstance(p, Export))._where
+    assert f"Run folder: {tmp_path / 'run'}<" in html.content
+    engine.skip_to(9)
+    assert until(lambda: page.hub.current is engine.latest())
+    engine.run_folder = tmp_path / "run-2"
+    engine._feed.publish(replace(engine.snapshot(), frame=0))
+    assert until(lambda: f"Run folder: {tmp_path / 'run-2'}<" in html.content)
 
 
 def test_that_a_run_prepares_is_no_notice_once_it_has_begun(engine, page):

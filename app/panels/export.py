@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +62,16 @@ class Panel(BasePanel):
             )
             hub.on(self._button("Save screenshot", viser.Icon.CAMERA, SCREENSHOT), self._later(self._screenshot))
             hub.on(self._button("Save HTML replay", viser.Icon.MOVIE, REPLAY), self._later(self._replay))
+        self._where = gui.add_html("")
+        self.begin()
 
     def _button(self, label: str, icon: viser.IconName, hint: str) -> viser.GuiButtonHandle:
         return self.hub.server.gui.add_button(label, icon=icon, color="gray", hint=hint)
+
+    def begin(self) -> None:
+        """Say where the run's files lie."""
+        folder = escape(str(self.hub.engine.run_folder.resolve()))
+        self._where.content = theme.card(f'<span class="dim">Run folder: {folder}</span>')
 
     def snapshot(self, s: Snapshot) -> None:
         """A replay that is not at its end exports what one does not see."""
