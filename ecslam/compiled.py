@@ -3,11 +3,7 @@ that of a callee does."""
 
 from __future__ import annotations
 
-import atexit
 import os
-import shutil
-import tempfile
-import warnings
 from pathlib import Path
 
 
@@ -17,6 +13,11 @@ def find_place(sources: Path) -> None:
     caches = Path(os.path.expanduser(os.environ.get("XDG_CACHE_HOME") or "~/.cache"))
     if "NUMBA_CACHE_DIR" in os.environ or _takes_files(sources / "__pycache__") or _takes_files(caches / "numba"):
         return
+    import atexit  # rarely wanted, and this is the first that a command imports
+    import shutil
+    import tempfile
+    import warnings
+
     place = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="ecslam-")
     atexit.register(shutil.rmtree, place, ignore_errors=True)
     warnings.warn(

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 LAYERS = (
     ("types", "messages", "config", "config_files"),
-    ("rigid", "indices", "compiled", "atomic", "cores"),
+    ("rigid", "indices", "compiled", "atomic", "cores", "interrupts"),
     ("se3",),
     ("kernels",),
     ("field",),
@@ -68,10 +68,11 @@ LAYERS = (
     ("reports",),
     ("commands",),
     ("cli",),
+    ("__main__",),
 )
 DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "tomllib": "tomli", "yaml": "pyyaml"}
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
-GROUND = {"types", "messages", "config", "indices", "compiled", "atomic", "cores"}
+GROUND = {"types", "messages", "config", "indices", "compiled", "atomic", "cores", "interrupts"}
 
 
 def module_name(path: Path) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..interrupts import interrupts_held
 from ..types import InputError, Mesh
 
 
@@ -14,6 +15,7 @@ class NoSurface(InputError):
     """There is no mesh, or one without triangles."""
 
 
+@interrupts_held()  # trimesh swallows nearly all that come while it is imported
 def load_mesh(path: Path, mend: str = "replace it") -> Mesh:
     """Read a triangle mesh (PLY, OBJ, GLB ...) with vertex colours where it has them.
 

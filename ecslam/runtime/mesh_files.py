@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from ..datasets.meshes import ply_bytes
+from ..interrupts import interrupts_held
 from ..types import InputError, Mesh
 
 
+@interrupts_held()
 def mesh_bytes(mesh: Mesh, format: str) -> bytes:
     """The mesh as ``ply``, ``glb`` or ``obj``. Raises InputError for another format or when trimesh is missing."""
     if format == "ply":
