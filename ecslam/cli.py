@@ -12,6 +12,7 @@ import typer
 from . import config_files
 from .config import Config
 from .runtime.files import require_place
+from .runtime.outlets import lasting_outputs
 from .types import InputError, Sequence
 
 app = typer.Typer(
@@ -204,7 +205,7 @@ def check(sequence: SequenceArgument) -> None:
     opened = open_sequence(sequence)
     config = resolve_config(None, opened, None, None, None, None)
     report = check_sequence(opened, config=config)
-    typer.echo(format_report(report))
+    print(format_report(report))
     if report.hopeless:
         raise InputError(f"{sequence}: none of the {report.frames_read} frames tried can be read; the report says why")
 
@@ -326,15 +327,17 @@ def resolve_config(
 
 
 def main() -> None:
-    """Entry point: a wrong input is one line on stderr and exit code 2, without a traceback."""
+    """A wrong input is one line on stderr and exit code 2, without a traceback. What the output does not take is left
+    out, and is exit code 1 unless its reader has gone."""
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal's encoding lacks
-    try:
-        app()
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-
-
-if __name__ == "__main__":
-    main()
+    code: str | int | None = 0
+    with lasting_outputs() as refused:
+        try:
+            app()
+        except InputError as error:
+            print(f"error: {error}", file=sys.stderr)
+            code = 2
+        except SystemExit as end:
+            code = end.code
+    sys.exit(code or int(any(not isinstance(error, BrokenPipeError) for error in refused)))

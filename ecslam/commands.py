@@ -25,7 +25,6 @@ from .runtime.files import beside, require_place, to_json
 from .runtime.judge import judge_run
 from .runtime.mesh_files import mesh_bytes
 from .runtime.meshjobs import MESH_POINTS, FrozenMap, build_mesh
-from .runtime.outlets import lasting_outputs
 from .runtime.runfolder import CAMERA, read_about
 from .runtime.signals import quit_on_signals
 from .types import InputError, Sequence
@@ -141,11 +140,10 @@ def start(engine: Engine, listener: socket.socket | None, host: str, browser: bo
     importing = threading.Thread(target=import_slam, name="import", daemon=True)
     importing.start()
     try:
-        with lasting_outputs():
-            if listener is None:
-                run_headless(engine)
-            else:
-                run_with_dashboard(engine, listener, host, browser)
+        if listener is None:
+            run_headless(engine)
+        else:
+            run_with_dashboard(engine, listener, host, browser)
     finally:
         importing.join()
 

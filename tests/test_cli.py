@@ -490,10 +490,19 @@ def test_a_demo_keeps_the_one_before(tmp_path, monkeypatch):
 
 def test_the_installed_command_refuses_without_a_traceback(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "ecslam.cli", "check", str(tmp_path)], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "ecslam", "check", str(tmp_path)], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert_refused(Outcome(done.returncode, done.stdout, done.stderr), "empty folder")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_an_output_that_takes_nothing_is_an_error_in_a_line():
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "ecslam", "check", f"{ROOM}&frames=2"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "note: the output takes no more (No space left on device); nothing more is printed\n"
 
 
 def test_help_names_every_command():

@@ -1,4 +1,4 @@
-"""Standard output that ends before a run does: a pipe that is closed, a disk that is full, a terminal that is gone."""
+"""Outputs that end before a command does: a pipe that is closed, a disk that is full, a terminal that is gone."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from typing import Any, TextIO, cast
 
 
 @contextmanager
-def lasting_outputs() -> Iterator[None]:
-    """Within the block, what standard output or standard error no longer takes is dropped, from any thread."""
+def lasting_outputs() -> Iterator[list[OSError]]:
+    """Within the block, what standard output or standard error no longer takes is dropped, from any thread; why, is in
+    the list."""
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (each and cast(TextIO, _Lasting(each)) for each in before)
+    refused: list[OSError] = []
+    sys.stdout, sys.stderr = (each and cast(TextIO, _Lasting(each, refused)) for each in before)
     try:
-        yield
+        yield refused
     finally:
         with suppress(AttributeError):  # closed from the start
             sys.stdout.flush()
@@ -25,8 +27,8 @@ def lasting_outputs() -> Iterator[None]:
 class _Lasting:
     """A stream that, the first time it cannot be written, says so on standard error and goes nowhere from then on."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    def __init__(self, stream: TextIO, refused: list[OSError]) -> None:
+        self._stream, self._refused = stream, refused
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -45,8 +47,9 @@ class _Lasting:
             self._end(error)
 
     def _end(self, error: OSError) -> None:
+        self._refused.append(error)
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, self._stream.fileno())
         os.close(nowhere)
-        told = f"note: the output takes no more ({error.strerror}); the run goes on without it"
+        told = f"note: the output takes no more ({error.strerror}); nothing more is printed"
         print(told, file=sys.stderr, flush=True)
