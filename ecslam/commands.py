@@ -152,7 +152,7 @@ def run_headless(engine: Engine) -> None:
     """Run to the end with a progress line, then say what came out and where it lies."""
     window = 0
     columns = (TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, refresh_per_second=4) as bar, quit_on_signals(engine):
+    with Progress(*columns, console=console, refresh_per_second=4) as bar, quit_on_signals(engine) as signals:
         task = bar.add_task("starting", total=None)
 
         def show(s: Snapshot) -> None:
@@ -168,6 +168,7 @@ def run_headless(engine: Engine) -> None:
 
         summary = engine.run(show, tell)
     finish_run(engine.run_folder, summary)
+    _end(engine, signals)
 
 
 def progress_line(s: Snapshot, window: int, wide: bool = True) -> str:
@@ -190,7 +191,7 @@ def run_with_dashboard(engine: Engine, listener: socket.socket, host: str, brows
     from ecslam_app import server
 
     reports = Reports(engine)
-    with quit_on_signals(engine):
+    with quit_on_signals(engine) as signals:
         dashboard = server.start(engine, host, listener=listener)
         _announce(dashboard, browser, "everything but an unfinished run's mesh is saved first")
         engine.start(reports.watch)
@@ -199,6 +200,15 @@ def run_with_dashboard(engine: Engine, listener: socket.socket, host: str, brows
     reports.close()
     if engine.error is not None:
         raise engine.error
+    _end(engine, signals)
+
+
+def _end(engine: Engine, signals: list[int]) -> None:
+    """A run that a signal cut short has been saved, and yet its status is that of the signal."""
+    ended = engine.summary["ended"] if engine.summary else "interrupted"
+    whole = ended in ("finished", "stopped") and (engine.run_folder / "mesh.ply").is_file()
+    if signals and not whole:
+        sys.exit(128 + signals[0])
 
 
 def view(folders: list[Path], host: str, port: int, browser: bool) -> None:

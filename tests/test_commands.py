@@ -1,8 +1,11 @@
 """What the command line says while the dashboard is up."""
 
+import contextlib
 import errno
+import json
 import os
 import re
+import signal
 import threading
 import webbrowser
 from types import SimpleNamespace
@@ -10,11 +13,12 @@ from urllib.request import urlopen
 
 import pytest
 from ecslam_app import server
-from fake_slam import Behaviour, FakeSequence
+from fake_slam import QUICK, Behaviour, FakeSequence, maker
 from runtime_watch import running
 
 from ecslam import commands, reports
 from ecslam.messages import Quit, Restart, Resume, State
+from ecslam.runtime.engine import Engine
 from ecslam.types import InputError
 
 
@@ -56,6 +60,24 @@ def test_a_run_that_was_left_before_its_first_checkpoint_is_to_be_started_again(
     said = capsys.readouterr().out
     assert "nothing to go on from: start again with ecslam run" in said
     assert not any(command in said for command in ("ecslam mesh", "ecslam resume"))
+
+
+@pytest.mark.parametrize(("state", "frames"), [(State.TRACKING, 100_000), (State.FINISHED, 4)])
+def test_a_run_that_a_signal_cuts_short_is_saved_and_has_its_status(tmp_path, monkeypatch, state, frames):
+    def interrupt(snapshot, *_, **__):
+        if snapshot.state is state and snapshot.frame > 2 and not done:
+            done.append(signal.raise_signal(signal.SIGTERM))
+        return ""
+
+    done, outcome = [], contextlib.nullcontext() if state is State.FINISHED else pytest.raises(SystemExit)
+    monkeypatch.setattr(commands, "progress_line", interrupt)
+    with outcome as end:
+        commands.run_headless(Engine(QUICK, FakeSequence(frames), tmp_path / "r", make=maker()))
+    assert done
+    assert end is None or end.value.code == 128 + signal.SIGTERM
+    summary = json.loads((tmp_path / "r/summary.json").read_text())
+    assert summary["ended"] == ("finished" if state is State.FINISHED else "interrupted")
+    assert len((tmp_path / "r/trajectory.txt").read_text().splitlines()) == summary["frames"] > 2
 
 
 def test_results_lost_to_a_full_disk_are_an_error(tmp_path, monkeypatch, capsys):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import threading
@@ -15,18 +14,18 @@ from .protocol import EngineHandle
 
 
 @contextmanager
-def quit_on_signals(engine: EngineHandle) -> Iterator[None]:
-    """Within the block, SIGINT, SIGTERM and SIGHUP submit ``Quit``; another one ends the process with 128 + its number.
+def quit_on_signals(engine: EngineHandle) -> Iterator[list[int]]:
+    """Within the block, SIGINT, SIGTERM and SIGHUP submit ``Quit``; another one ends the process. The list takes the
+    number of the first.
 
     SIGHUP stays ignored where it is (``nohup``). Call it in the main thread.
     """
-    asked = False
+    came: list[int] = []
 
     def handle(number: int, _: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
-            os._exit(128 + number)
-        asked = True
+        came.append(number)
+        for each in numbers:
+            signal.signal(each, signal.SIG_DFL)
         print("stopping after this frame and saving; once more quits at once", file=sys.stderr, flush=True)
         # In a thread of its own: the interrupted code may hold the lock that submit takes.
         threading.Thread(target=engine.submit, args=(Quit(),), daemon=True).start()
@@ -36,7 +35,7 @@ def quit_on_signals(engine: EngineHandle) -> Iterator[None]:
         numbers.append(signal.SIGHUP)
     before = {number: signal.signal(number, handle) for number in numbers}
     try:
-        yield
+        yield came
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
