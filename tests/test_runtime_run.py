@@ -135,6 +135,11 @@ def test_a_sequence_without_a_usable_frame_is_an_error(tmp_path):
         run(tmp_path, FakeSequence(4), Behaviour(empty=(0, 1, 2, 3)))
 
 
+def test_a_long_sequence_without_a_usable_frame_is_given_up_early(tmp_path):
+    with pytest.raises(InputError, match=r"none of 201 frames could be used.*frame 0: no usable depth"):
+        run(tmp_path, FakeSequence(1000), Behaviour(empty=tuple(range(1000))))
+
+
 class Slow(FakeSequence):
     """Its first frame waits for ``go``."""
 

@@ -125,8 +125,8 @@ class Run:
     def feed(self, index: int, item: Frame | FrameError, interrupt: Callable[[], None]) -> StepReport | None:
         """Process a frame, or skip it (None) when it is unreadable or out of order in time.
 
-        Raises InputError when too many frames are unreadable, and whatever ``interrupt`` raises (the run is then
-        ``torn``: the frame at work is lost and there are no more checkpoints).
+        Raises InputError when too many frames are unreadable or none is of use, and whatever ``interrupt`` raises (the
+        run is then ``torn``: the frame at work is lost and there are no more checkpoints).
         """
         if self.tally.position == 0:
             for text in problems(self.plan.sequence):
@@ -200,6 +200,8 @@ class Run:
                 f"{self.plan.address}: at least {len(bad)} of {frames} frames cannot be read, the first being "
                 f"{bad[0]}; look at it with: ecslam check"
             )
+        if self.tally.none_usable(frames):
+            self.require_frames()
 
     def require_frames(self) -> None:
         """Raises InputError when no frame so far could be used."""

@@ -11,6 +11,7 @@ import numpy as np
 from ..messages import StepReport
 
 UNREADABLE_SHARE = 0.20
+LEAST_TRIED = 100
 
 
 @dataclass
@@ -50,6 +51,10 @@ class Tally:
     def too_many_unreadable(self, frames: int) -> bool:
         """Whether the run over ``frames`` frames is not worth going on with."""
         return len(self.unreadable) > UNREADABLE_SHARE * frames
+
+    def none_usable(self, frames: int) -> bool:
+        """Whether none of the frames so far was of use, and these are enough of ``frames`` to give the rest up."""
+        return not self.rows and self.skipped > max(LEAST_TRIED, UNREADABLE_SHARE * frames)
 
     @property
     def fps_wall(self) -> float:
