@@ -61,6 +61,8 @@ def other_quaternions() -> np.ndarray:
         ("qw qx qy qz", Spoilt(other_quaternions())),
         ("5 times as much", Spoilt(ROOM.poses_gt(), 0.2)),
         ("a fifth", Spoilt(ROOM.poses_gt(), 5.0)),
+        ("10 times as much", Spoilt(ROOM.poses_gt(), 0.1)),
+        ("a tenth", Spoilt(ROOM.poses_gt(), 10.0)),
         ("wrong poses", Spoilt(ROOM.poses_gt() @ TURNED)),
     ],
 )

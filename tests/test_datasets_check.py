@@ -100,6 +100,8 @@ def test_a_healthy_recording_is_measured_and_not_odd() -> None:
 SPOILT: list[tuple[str, Callable[[], Recording]]] = [
     ("wrong depth scale", lambda: Recording(depth=np.full((H, W), 0.002, np.float32))),
     ("wrong depth scale", lambda: Recording(depth=np.full((H, W), 50, np.float32))),
+    ("a fifth of or a tenth of that would be a room's", lambda: Recording(depth=np.full((H, W), 12, np.float32))),
+    ("correct the depth scale", lambda: Recording(depth=np.full((H, W), 9.9, np.float32))),
     ("100% of the depth is beyond depth_far_m = 8", lambda: Recording(depth=np.full((H, W), 9, np.float32))),
     ("40 of 40 frames are black", lambda: Recording(color=1)),
     ("40 of 40 frames have no depth", lambda: Recording(depth=np.zeros((H, W), np.float32))),

@@ -320,7 +320,10 @@ def test_what_is_odd_about_a_sequence_is_told_and_kept(tmp_path):
     told = []
     summary = engine(tmp_path, sequence).run(tell=told.append)
     assert summary["warnings"][:2] == ["2 images have no partner", "1 gaps of more than 1 s between frames"]
-    assert summary["warnings"][2] == "frame 0: the median depth is 30 m: probably a wrong depth scale"
+    assert summary["warnings"][2] == (
+        "frame 0: the median depth is 30 m: probably a wrong depth scale; a tenth of that would be a room's, so export "
+        "it in the layout's unit"
+    )
     assert len(summary["warnings"]) == 3
     assert next(n.text for n in told if n.level == "warning") == "2 images have no partner"
     logged = [e["text"] for e in read_lines(tmp_path / "events.jsonl")]

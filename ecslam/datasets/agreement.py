@@ -61,6 +61,8 @@ OTHERS = (
     Reading("quaternions were qw qx qy qz, for they seem not to be qx qy qz qw", w_first=True),
     Reading("depth were 5 times as much: a wrong depth scale", stretch=0.2),
     Reading("depth were a fifth: a wrong depth scale", stretch=5.0),
+    Reading("depth were 10 times as much: a wrong depth scale", stretch=0.1),
+    Reading("depth were a tenth: a wrong depth scale", stretch=10.0),
 )
 
 

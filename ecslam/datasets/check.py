@@ -19,6 +19,8 @@ from .registry import open_sequence
 from .views import GAP_S, problems
 
 USUAL_DEPTH_M = (0.2, 10.0)
+ROOMS_MEDIAN_M = (0.5, 5.0)
+SCALES = {1e3: "1000 times", 10.0: "10 times", 5.0: "5 times", 0.2: "a fifth of", 0.1: "a tenth of", 1e-3: "1/1000 of"}
 MOST_WITHOUT_DEPTH = 0.6
 MOST_LEFT_OUT = 0.5
 HARDLY_ANY = 0.05
@@ -276,11 +278,14 @@ def lacking_depth(depth: NDArray[np.float32], used_m: tuple[float, float]) -> st
 
 def _odd_distance(median_m: float, too_near: float, too_far: float, used_m: tuple[float, float]) -> str:
     if median_m < USUAL_DEPTH_M[0] or median_m > USUAL_DEPTH_M[1]:
-        return f"the median depth is {median_m:.3g} m: probably a wrong depth scale"
-    if too_near > MOST_LEFT_OUT:
-        return f"{too_near:.0%} of the depth is below depth_near_m = {used_m[0]:g} and left out: lower that with --set"
-    if too_far > MOST_LEFT_OUT:
-        return f"{too_far:.0%} of the depth is beyond depth_far_m = {used_m[1]:g} and left out: raise that with --set"
+        likely = [name for scale, name in SCALES.items() if ROOMS_MEDIAN_M[0] <= scale * median_m <= ROOMS_MEDIAN_M[1]]
+        hint = f"; {' or '.join(likely)} that would be a room's, so export it in the layout's unit" if likely else ""
+        return f"the median depth is {median_m:.3g} m: probably a wrong depth scale{hint}"
+    small = f"is below depth_near_m = {used_m[0]:g} and left out: lower that with --set"
+    large = f"is beyond depth_far_m = {used_m[1]:g} and left out: raise that with --set"
+    for share, text in ((too_near, small), (too_far, large)):
+        if share > MOST_LEFT_OUT:
+            return f"{share:.0%} of the depth {text}, or correct the depth scale if the room is not like that"
     return ""
 
 
