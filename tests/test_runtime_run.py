@@ -440,6 +440,16 @@ def test_resume_notes_where_the_sequence_has_moved(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 30
 
 
+def test_resume_writes_again_what_has_been_lost(tmp_path):
+    interrupted(tmp_path)
+    names = ("groundtruth.txt", "config.yaml")
+    before = [(tmp_path / name).read_bytes() for name in names]
+    (tmp_path / "groundtruth.txt").unlink()
+    (tmp_path / "config.yaml").write_text("")
+    Engine.resume(tmp_path, sequence=FakeSequence(30), make=maker()).run()
+    assert [(tmp_path / name).read_bytes() for name in names] == before
+
+
 def test_resume_knows_the_error_so_far(tmp_path):
     interrupted(tmp_path)
     seen = []

@@ -101,6 +101,7 @@ class Run:
             self.measure()
         else:
             self._describe()
+        self._write_inputs()
 
     def _describe(self) -> None:
         """Write what the run is about, before it begins."""
@@ -115,10 +116,14 @@ class Run:
         }
         about |= {name: getattr(s.intrinsics, name) for name in CAMERA}
         self.folder.write("run.json", about)
+
+    def _write_inputs(self) -> None:
+        """Also where a run goes on: both may have been lost since."""
         self.folder.write("config.yaml", config_files.to_yaml(self.config))
         if self.truth is not None:
             known = np.isfinite(self.truth).all((1, 2)) & self._in_order
-            self.folder.write("groundtruth.txt", format_tum(s.timestamps()[known], self.truth[known]))
+            times = self.plan.sequence.timestamps()
+            self.folder.write("groundtruth.txt", format_tum(times[known], self.truth[known]))
 
     # ---- frames ---------------------------------------------------------------------------------------------------
 
