@@ -261,7 +261,7 @@ def test_a_missing_depth_image_is_refused_on_opening(layout: str, folder: Path) 
     if layout == "stray":
         pytest.skip("a phone's frame may be without depth")
     depth_files(folder)[2].unlink()
-    with pytest.raises(InputError, match=r"missing|without its depth") as caught:
+    with pytest.raises(InputError, match=r"missing|without its depth image \(a 16-bit PNG\)") as caught:
         open_sequence(folder)
     assert str(folder) in str(caught.value)
     assert "\n" not in str(caught.value)

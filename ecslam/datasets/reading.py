@@ -42,10 +42,10 @@ def paired(color: dict[int, Path], depth: dict[int, Path], folder: Path) -> list
     """The frame numbers, once it is sure that each has both images. Raises InputError naming the first that has not."""
     alone = sorted(color.keys() ^ depth.keys())
     if alone:
-        missing, present = ("depth", color) if alone[0] in color else ("colour", depth)
+        missing, present = ("depth image (a 16-bit PNG)", color) if alone[0] in color else ("colour image", depth)
         raise InputError(
             f"{folder}: {len(color)} colour and {len(depth)} depth images; {present[alone[0]].name} is the first "
-            f"without its {missing} image; add the missing files or remove those left over"
+            f"without its {missing}; add the missing files or remove those left over"
         )
     if not color:
         raise InputError(f"{folder}: no colour and depth images; give the folder that holds them")
