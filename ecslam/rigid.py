@@ -26,6 +26,13 @@ def orthonormalise(c2w: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
+def is_rigid(c2w: NDArray[np.float64]) -> bool:
+    """Whether an array is a 4x4 matrix of a rigid motion, to about a hundredth."""
+    if c2w.shape != (4, 4) or not np.isfinite(c2w).all():
+        return False
+    return bool(np.abs(orthonormalise(c2w) - c2w).max() < 1e-2 and np.allclose(c2w[3], [0, 0, 0, 1]))
+
+
 def best_motion(source: NDArray[np.floating], target: NDArray[np.floating]) -> NDArray[np.float64]:
     """The motions [..., 4, 4] that bring points [..., N, 3] closest to others in least squares; N >= 1."""
     middle, goal = source.mean(-2), target.mean(-2)

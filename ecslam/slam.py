@@ -29,11 +29,12 @@ from .keyframes import Keyframe, Shelf, make_keyframe, surface_points
 from .loops import LoopDetector, loop_event
 from .mapper import Mapper, MapResult
 from .messages import MOVING, LoopEvent, StepReport
+from .rigid import is_rigid
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .scene_box import SceneBox
 from .shutter import STILL
 from .trajectory import Trajectory
-from .types import Frame, FrameError, Intrinsics
+from .types import Frame, FrameError, InputError, Intrinsics
 from .views import ColorQuery, SdfQuery, queries, render_view
 from .window import random_window, select_window
 
@@ -74,7 +75,7 @@ class Slam:
         first_pose: NDArray[np.float64] | None = None,
     ) -> None:
         """bounds: scene box [2, 3] metres, derived from the first frame when None. first_pose: c2w [4, 4] of the first
-        frame, the identity when None; it stays fixed."""
+        frame, the identity when None; it stays fixed. Raises InputError where that is no rigid motion."""
         self.config, self.intrinsics = config, intrinsics
         self.device = device or torch.device("cpu")
         self.kernels_name, self._kernels, self.kernels_note = seam.select(self.device)
@@ -83,6 +84,8 @@ class Slam:
         self._shelf = Shelf()
         self.mapper: Mapper | None = None
         self._first_pose = np.eye(4) if first_pose is None else np.array(first_pose, np.float64)
+        if not is_rigid(self._first_pose):
+            raise InputError("first_pose is no 4x4 matrix of a rigid motion, from the camera to the world in metres")
         self._box = SceneBox(config.field, bounds)
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
@@ -101,7 +104,9 @@ class Slam:
 
     @flushed()
     def step(self, frame: Frame, interrupt: Interrupt | None = None) -> StepReport:
-        """Track the frame; every n-th frame, map. Raises whatever ``interrupt`` raises, called inside long loops."""
+        """Track the frame; every n-th frame, map. Raises FrameError for one that is not of this camera, and whatever
+        ``interrupt`` raises, called inside long loops."""
+        frame.require_fit(self.intrinsics)
         frame = denoised(frame, self.config)
         if self.mapper is None:
             return self._first_frame(frame, interrupt)

@@ -95,6 +95,15 @@ class Frame:
     keyframe: object = None
     measured: NDArray[np.float32] | None = None
 
+    def require_fit(self, camera: Intrinsics) -> None:
+        """Raises FrameError where colour or depth are no arrays of the size of ``camera`` and of the type above."""
+        size = camera.height, camera.width
+        for name, kind, shape in (("color", "uint8", (*size, 3)), ("depth", "float32", size)):
+            array: NDArray[np.generic] = getattr(self, name)
+            if array.dtype != kind or array.shape != shape:
+                found = f"{array.dtype} {list(array.shape)}"
+                raise FrameError(f"frame {self.index}: {name} is {found}, but its camera makes {kind} {list(shape)}")
+
 
 @dataclass(frozen=True)
 class Mesh:

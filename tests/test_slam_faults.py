@@ -13,7 +13,7 @@ from ecslam.datasets import open_sequence
 from ecslam.messages import StepReport
 from ecslam.slam import Slam
 from ecslam.tracker import HostTracker
-from ecslam.types import Frame, FrameError
+from ecslam.types import Frame, FrameError, InputError
 
 ROOM = open_sequence("synthetic/studio?size=160x120")
 QUICK = ["mapping.first_iterations=60", "mapping.rays=800", "keyframe_share=0.2"]
@@ -242,3 +242,23 @@ def test_depth_that_is_not_finite_or_out_of_range_is_none():
     assert all(np.isfinite(value).all() for value in slam.state().values() if value.dtype.kind == "f")
     points = slam.surface_points(100_000)()
     assert (np.linalg.norm(points - slam.trajectory[-1][:3, 3], axis=1) < 9).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda f: replace(f, color=f.color[::2, ::2], depth=f.depth[::2, ::2]), r"color is uint8 \[60, 80, 3\]"),
+        (lambda f: replace(f, depth=f.depth[::2, ::2]), r"depth is float32 \[60, 80\]"),
+        (lambda f: replace(f, depth=(1000 * f.depth).astype(np.uint16)), r"makes float32 \[120, 160\]"),
+        (lambda f: replace(f, color=f.color[..., 0]), r"color is uint8 \[120, 160\], but its camera makes"),
+    ],
+)
+def test_a_frame_of_another_camera_is_refused(change, says):
+    with pytest.raises(FrameError, match=says):
+        engine().step(change(ROOM[0]))
+
+
+@pytest.mark.parametrize("pose", [np.full((4, 4), np.nan), 2 * np.eye(4), np.eye(3), np.diag([1.0, 1, -1, 1])])
+def test_a_first_pose_that_is_no_rigid_motion_is_refused(pose):
+    with pytest.raises(InputError, match="first_pose"):
+        Slam(live(), ROOM.intrinsics, first_pose=pose)
