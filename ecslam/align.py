@@ -91,10 +91,11 @@ def stages(config: Config) -> list[AlignSettings]:
     return out
 
 
-def known_points(surface: Surface, pixels: Pixels, guess: NDArray[np.float64]) -> Points:
+def known_points(surface: Surface, pixels: Pixels, guess: NDArray[np.float64], gain: float = 1.0) -> Points:
     """The measured points of ``pixels`` that lie, seen from ``guess`` [4, 4], where the surface is known; all of them
-    when that leaves too few."""
-    local, light = pixels.points(), pixels.color[pixels.depth > 0].astype(np.float32) @ LUMINANCE
+    when that leaves too few. gain: of their luminance, which is cut off at 1."""
+    local, color = pixels.points(), pixels.color[pixels.depth > 0]
+    light = np.minimum(color.astype(np.float32) @ (LUMINANCE * np.float32(gain)), np.float32(1))
     _, known = surface.distances(transform(guess, local))
     if known.sum() >= LEAST_KNOWN:
         local, light = local[known], light[known]

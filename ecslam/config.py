@@ -162,7 +162,7 @@ class Config:
     """Everything a run depends on besides the sequence. Defaults are the paper's lite preset on Replica.
 
     denoise: smooth depth by as much as it is noisy (ours). deskew: take out the motion during a rolling shutter (ours,
-    see ``shutter``). exposure: bring colours to the first frame's exposure and white balance (ours, see ``exposure``).
+    see ``shutter``). exposure: bring luminance to what the first frame's exposure would give (ours, see ``exposure``).
     movers: whether what moves by itself is left in (ours, see ``movers``).
     """
 

@@ -19,11 +19,11 @@ Cells = NDArray[np.float32]
 
 
 class Views(NamedTuple):
-    """Earlier views, the newest first. seen: float32 [V, 2, h, w], see ``around``. tints: float32 [V, h, w, 3], see
-    ``tint``. keyframes: their numbers [V]."""
+    """Earlier views, the newest first. seen: float32 [V, 2, h, w], see ``around``. lights: float32 [V, h, w], see
+    ``light``, at the first frame's exposure. keyframes: their numbers [V]."""
 
     seen: NDArray[np.float32]
-    tints: NDArray[np.float32]
+    lights: NDArray[np.float32]
     keyframes: list[int]
 
 
@@ -32,31 +32,31 @@ class EarlierViews:
 
     def __init__(self) -> None:
         self._seen: list[NDArray[np.float32]] = []
-        self._tints: list[NDArray[np.float32]] = []
+        self._lights: list[Cells] = []
         self._keyframes: list[int] = []
         self._ask()
 
     def _ask(self) -> None:
         """Work out which of what is remembered is asked from now on."""
         asked = range(len(self._seen))[::-EVERY]
-        seen, tints = (np.array([kept[i] for i in asked]) for kept in (self._seen, self._tints))
-        self.asked = Views(seen, tints, [self._keyframes[i] for i in asked])
+        seen, lights = (np.array([kept[i] for i in asked]) for kept in (self._seen, self._lights))
+        self.asked = Views(seen, lights, [self._keyframes[i] for i in asked])
 
     def remember(self, frame: Frame, keyframe: int) -> None:
         """Keep what a frame saw that is the keyframe number ``keyframe``."""
         self._seen = [*self._seen, around(relief_of(frame))][-KEPT:]
-        self._tints = [*self._tints, tint_of(frame)][-KEPT:]
+        self._lights = [*self._lights, light_of(frame) + np.float32(np.log(frame.gain))][-KEPT:]
         self._keyframes = [*self._keyframes, keyframe][-KEPT:]
         self._ask()
 
     def state(self) -> dict[str, NDArray[Any]]:
         """What ``load`` needs."""
-        seen, tints = (np.array(kept, np.float32) for kept in (self._seen, self._tints))
-        return {"seen": seen, "tints": tints, "keyframes": np.array(self._keyframes, np.int64)}
+        seen, lights = (np.array(kept, np.float32) for kept in (self._seen, self._lights))
+        return {"seen": seen, "lights": lights, "keyframes": np.array(self._keyframes, np.int64)}
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from what ``state`` gave."""
-        self._seen, self._tints = list(state["seen"]), list(state["tints"])
+        self._seen, self._lights = list(state["seen"]), list(state["lights"])
         self._keyframes = state["keyframes"].tolist()
         self._ask()
 
@@ -66,9 +66,9 @@ def relief_of(frame: Frame) -> Cells:
     return relief(frame.depth) if frame.relief is None else frame.relief
 
 
-def tint_of(frame: Frame) -> NDArray[np.float32]:
-    """A frame's tint, which somebody may have looked at already."""
-    return tint(frame.color) if frame.tint is None else frame.tint
+def light_of(frame: Frame) -> Cells:
+    """A frame's light, which somebody may have looked at already."""
+    return light(frame.color) if frame.light is None else frame.light
 
 
 def cell_px(width: int) -> int:
@@ -91,13 +91,13 @@ def relief(depth: NDArray[np.float32]) -> Cells:
     return out
 
 
-def tint(color: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The logarithm of the mean colour of each cell [h, w, 3] of an image; NaN where that is too dark or too bright."""
+def light(color: NDArray[np.uint8]) -> Cells:
+    """The logarithm of the mean luminance of each cell [h, w] of an image; NaN where that is too dark or too bright."""
     cell = cell_px(color.shape[1])
     height, width = (side // cell for side in color.shape[:2])
-    mean = cv2.resize(color[: height * cell, : width * cell], (width, height), interpolation=cv2.INTER_AREA)
-    fair = ((mean >= DARK) & (mean <= BRIGHT)).all(2, keepdims=True)
-    return np.log(np.where(fair, mean, np.nan), dtype=np.float32)
+    small = cv2.resize(color[: height * cell, : width * cell], (width, height), interpolation=cv2.INTER_AREA)
+    mean = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    return np.log(np.where((mean >= DARK) & (mean <= BRIGHT), mean, np.nan), dtype=np.float32)
 
 
 def around(seen: Cells) -> NDArray[np.float32]:

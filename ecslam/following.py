@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from .align import LearnedSurface, Surface
 from .config import Config
 from .earlier import EarlierViews
-from .exposure import AS_AT_FIRST, exposed, gains
+from .exposure import as_at_first
 from .field import TsdfField
 from .kernels import Backend
 from .kernels.graphs import Recorder
@@ -63,7 +64,7 @@ class Follower:
         self._generator = generator if device.type == "cpu" else None
         self.recorder = Recorder(plain=kernels_name != "gpu")
         self.recovery = Recovery()
-        self._earlier, self._gains = EarlierViews(), AS_AT_FIRST
+        self._earlier, self._gain = EarlierViews(), 1.0
         lengths, fused = (config.align.voxel_m, config.truncation_m), config.align.to == "fused"
         self._volume = create_volume(kernels_name, *lengths, device, self.recorder) if fused else None
         self._observed: ObservedVoxels | ObservedTable = ObservedVoxels()
@@ -86,14 +87,16 @@ class Follower:
         return Expected(trajectory.predict(frame.timestamp) if known else trajectory[-1], known, gap)
 
     def exposed(self, frame: Frame, expected: Expected, trajectory: Trajectory, config: Config) -> Frame:
-        """The frame with the colours that it would have at the exposure and white balance of the first one; those of
-        the frame before count where it is not known what earlier keyframes saw of it."""
+        """The frame with the gain that makes it as bright as if it were exposed as the first one; that of the frame
+        before where it is not known what earlier keyframes saw of it."""
         if not config.exposure:
             return frame
-        if expected.known:
-            known = self._earlier.asked, trajectory.keyframe_poses()
-            self._gains = gains(frame, self._camera, expected.c2w, *known, self._gains)
-        return exposed(frame, self._gains)
+        if not expected.known:
+            return replace(frame, gain=self._gain)
+        known = self._earlier.asked, trajectory.keyframe_poses()
+        frame = as_at_first(frame, self._camera, expected.c2w, *known, self._gain)
+        self._gain = frame.gain
+        return frame
 
     def still(self, frame: Frame, expected: Expected, trajectory: Trajectory, config: Config) -> Frame:
         """The frame without what moves by itself, where it is known what was there before."""
@@ -165,7 +168,7 @@ class Follower:
             **prefixed("observed", self._observed.state() | {"trained": np.array(self._trusted)}),
             **prefixed("volume", self._volume.state() if self._volume is not None else {}),
             **prefixed("earlier", self._earlier.state()),
-            "gains": self._gains,
+            "gain": np.array(self._gain),
             "lost": self.recovery.state(),
         }
 
@@ -176,5 +179,5 @@ class Follower:
         if self._volume is not None:
             self._volume.load(part("volume", state))
         self._earlier.load(part("earlier", state))
-        self._gains = state["gains"]
+        self._gain = float(state["gain"])
         self.recovery.load(state["lost"])

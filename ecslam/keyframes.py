@@ -49,13 +49,6 @@ class Keyframe:
         landmarks = replace(known, points=straight(known.points, camera, sweep))
         return Keyframe.of(self.frame, straight_pixels(self.pixels, camera, sweep), self.thumbnail, landmarks)
 
-    def recoloured(self, table: NDArray[np.uint8]) -> Keyframe:
-        """The same keyframe with other values for the 256 that red, green and blue may have: ``table`` [256, 3]."""
-        out = Keyframe(self.frame, self.record.copy())
-        color = out.pixels.color
-        color[:] = cv2.LUT(color[None], table[None])[0]
-        return out
-
     def __len__(self) -> int:
         """How many pixels are stored."""
         return (len(self.record) - self._pixels_from) // PIXEL_BYTES

@@ -53,11 +53,11 @@ def grid_cells(frame: DeviceFrame, count: int, config: Config) -> int:
     return rows * columns
 
 
-def spread(frame: DeviceFrame, camera: Intrinsics, count: int, config: Config, jitter: Tensor) -> Tensor:
+def spread(frame: DeviceFrame, camera: Intrinsics, count: int, config: Config, jitter: Tensor, gain: Tensor) -> Tensor:
     """The points of a pixel in each cell of the uniform grid of about ``count``: see ``tracking_gpu.spread``. jitter:
-    [grid_cells, 2] in 0..1."""
+    [grid_cells, 2] in 0..1. gain: float64 [1]."""
     cells, luminance = _cells(frame, count, config), tuple(map(float, LUMINANCE))
-    return tracking_gpu.spread(frame.color, frame.depth, jitter, cells, _lens(camera, config), luminance)
+    return tracking_gpu.spread(frame.color, frame.depth, jitter, cells, _lens(camera, config), luminance, gain)
 
 
 def choose(

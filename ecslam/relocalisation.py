@@ -62,7 +62,8 @@ class Relocalisation:
         if len(starts) == 0 or len(self._measured.points()) < LEAST_POINTS:
             return None
         wide = replace(self.config, align=replace(self.config.align, kernels_m=KERNELS_M, iterations=ITERATIONS))
-        return best_start(lambda start: track_direct(self.surface, self._measured, start, wide), starts)
+        gain = self.frame.gain
+        return best_start(lambda start: track_direct(self.surface, self._measured, start, wide, gain), starts)
 
     @cached_property
     def _measured(self) -> Pixels:

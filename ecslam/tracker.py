@@ -74,7 +74,7 @@ class HostTracker:
         if len(measured.points()) < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
         c2w, losses = guess, {}
-        points = known_points(surface, measured, guess)
+        points = known_points(surface, measured, guess, frame.gain)
         if config.align.to != "none":
             found = align(surface, points, guess, config)
             c2w, losses = found.c2w, {"align_mm": 1e3 * found.cost**0.5}
@@ -150,8 +150,10 @@ def fit(surface: Surface, pixels: Pixels, c2w: NDArray[np.float64], truncation_m
     return float((np.abs(distance[known]) < 0.5 * truncation_m).mean())
 
 
-def track_direct(surface: Surface, pixels: Pixels, guess: NDArray[np.float64], config: Config) -> TrackResult:
-    """Our own tracking: direct alignment to ``surface`` from ``guess`` [4, 4]."""
-    found = align(surface, known_points(surface, pixels, guess), guess, config)
+def track_direct(
+    surface: Surface, pixels: Pixels, guess: NDArray[np.float64], config: Config, gain: float
+) -> TrackResult:
+    """Our own tracking: direct alignment to ``surface`` from ``guess`` [4, 4]. gain: of the pixels' luminance."""
+    found = align(surface, known_points(surface, pixels, guess, gain), guess, config)
     quality = fit(surface, pixels, found.c2w, config.truncation_m)
     return TrackResult(found.c2w, {"align_mm": 1e3 * found.cost**0.5}, quality)

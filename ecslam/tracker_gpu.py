@@ -55,7 +55,7 @@ class GpuTracker:
         points, rays = grid_cells(shown, a.points, config), t.rays if t.iterations else 0
         numbers = uniform(self.generator, device, 2 * points + rays * (3 + s.uniform + s.near_depth))
         corners = torch.from_numpy(padded_corners(frame, config, rays)).to(device, non_blocking=True)
-        start = torch.from_numpy(np.concatenate([guess.reshape(16), sweep])).to(device, non_blocking=True)
+        start = torch.from_numpy(np.concatenate([guess.reshape(16), sweep, [frame.gain]])).to(device, non_blocking=True)
         order = _shuffled(grid_cells(shown, rays, config) if rays else 0, device)
         rates = _rates(t.lr_rotation, t.lr_translation, device)
         over = field, self.volume.blocks, config, shown, order, rates
@@ -79,12 +79,12 @@ class GpuTracker:
         numbers: Tensor,
     ) -> tuple[Tensor]:
         """Everything as a function of tensors: float64 [TOLD, and the loss terms where frames are rendered]. start:
-        float64 [22], the guess [4, 4] and the sweep [6]."""
+        float64 [23], the guess [4, 4], the sweep [6] and the gain of the frame."""
         a, settings = config.align, tuple(stages(config))
         cells = grid_cells(frame, a.points, config)
-        points = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2))
+        points = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2), start[22:])
         rolling = self.camera.readout_s > 0 and config.deskew
-        guess, sweep = start[:16].view(4, 4), start[16:]
+        guess, sweep = start[:16].view(4, 4), start[16:22]
         points = straight(points, self.camera, sweep) if rolling else points
         packed, first = tracking_gpu.packed(blocks, points, guess, LEAST_KNOWN)
         row = fusion_gpu.descend(blocks, packed, first, settings, a.iterations, COARSE_STRIDE, RULES)

@@ -79,9 +79,10 @@ class Frame:
 
     index: position in the sequence. timestamp: seconds. color: uint8 [H, W, 3], RGB. depth: float32 [H, W], metres
     along the optical axis, exactly 0 where there is none (never NaN or Inf). c2w_gt: float64 [4, 4] camera-to-world
-    ground truth in metres, or None. corners: of ``color``, where somebody has looked for them already. relief, tint: of
-    ``depth`` and ``color``, likewise (see ``earlier``). keyframe: what ``keyframes.prepared`` made of it. measured:
-    what was measured, where ``depth`` has been smoothed since.
+    ground truth in metres, or None. corners: of ``color``, where somebody has looked for them already. relief, light:
+    of ``depth`` and ``color``, likewise (see ``earlier``). keyframe: what ``keyframes.prepared`` made of it. measured:
+    what was measured, where ``depth`` has been smoothed since. gain: times which its luminance would be at the exposure
+    of the first frame (see ``exposure``).
     """
 
     index: int
@@ -91,9 +92,10 @@ class Frame:
     c2w_gt: NDArray[np.float64] | None = None
     corners: Corners | None = None
     relief: NDArray[np.float32] | None = None
-    tint: NDArray[np.float32] | None = None
+    light: NDArray[np.float32] | None = None
     keyframe: object = None
     measured: NDArray[np.float32] | None = None
+    gain: float = 1.0
 
     def require_fit(self, camera: Intrinsics) -> None:
         """Raises FrameError where colour or depth are no arrays of the size of ``camera`` and of the type above."""

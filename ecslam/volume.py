@@ -51,7 +51,9 @@ class FusedVolume:
         """Average a frame seen from c2w [4, 4] during ``sweep`` (see ``shutter``) into the volume; depth outside
         near..far counts as none."""
         depth = np.where((frame.depth >= near_m) & (frame.depth <= far_m), frame.depth, np.float32(0))
-        light = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1 / 255)
+        light = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(frame.gain / 255)
+        if frame.gain > 1:
+            np.minimum(light, np.float32(1), out=light)
         numbers = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         step, threads = fusion_views.NORMAL_STRIDE, torch.get_num_threads()
         normal = np.empty((-(-depth.shape[0] // step), -(-depth.shape[1] // step), 3), np.float32)

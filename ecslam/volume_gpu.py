@@ -62,7 +62,7 @@ class GpuVolume:
         self._grow_in_time()
         self._now += 1
         lens = camera.fx, camera.fy, camera.cx, camera.cy
-        numbers = [*c2w[:3].flat, *lens, near_m, far_m, self._now, *sweep]
+        numbers = [*c2w[:3].flat, *lens, near_m, far_m, self._now, *sweep, frame.gain]
         steps = int(np.ceil(2 * self.truncation_m / (0.5 * EDGE * self.voxel_m))) + 1
         blocks, listed, shown = self.blocks, self._listed, self.show(frame)
 

@@ -27,6 +27,7 @@ CAMERA = Intrinsics(48.0, 47.0, 23.6, 17.3, 48, 36)
 CONFIG = Config(border_px=2, depth_near_m=0.5, depth_far_m=2.05)
 LENGTHS = (0.04, 0.11)
 TRUE = pose((2, 3, -1), (0.02, 0.01, -0.02))
+GAIN = torch.ones(1, dtype=torch.float64, device=DEVICE)
 ELSEWHERE = pose((20, 30, -10), (1.023, 0.317, -2.029))  # where no plane is the side of a voxel
 
 
@@ -87,23 +88,24 @@ def test_a_frame_takes_the_place_of_one_of_its_size(seen):
     assert other.depth.shape == (len(depth) - 1, depth.shape[1])
 
 
-@pytest.mark.parametrize("count", [1, 128, 300])
-def test_points_are_spread_over_the_image(seen, count):
+@pytest.mark.parametrize(("count", "gain"), [(1, 1.0), (128, 0.7), (300, 1.6)])
+def test_points_are_spread_over_the_image(seen, count, gain):
     shown = DeviceFrame.of(seen, DEVICE)
     cells = grid_cells(shown, count, CONFIG)
     jitter = numbers(cells, 2)
-    points = spread(shown, CAMERA, count, CONFIG, jitter).cpu().numpy()
+    points = spread(shown, CAMERA, count, CONFIG, jitter, gain * GAIN).cpu().numpy()
     rows = round(np.ceil(np.sqrt(count * 32 / 44)))
     v, u = in_grid(np.arange(cells), rows, cells // rows, jitter.cpu().numpy())
     direction, depth = rays_at(seen, v, u)
     np.testing.assert_allclose(points[:, :3], direction * depth[:, None], atol=1e-5)
-    np.testing.assert_allclose(points[:, 3], seen.color[v, u].astype(np.float32) @ LUMINANCE, atol=1e-6)
+    light = np.minimum(gain * (seen.color[v, u].astype(np.float32) @ LUMINANCE), 1)
+    np.testing.assert_allclose(points[:, 3], light, atol=1e-6)
     assert count < 300 or 0.05 < (depth == 0).mean() < 0.9
 
 
 def points_of(seen, count):
     shown = DeviceFrame.of(seen, DEVICE)
-    return spread(shown, CAMERA, count, CONFIG, numbers(grid_cells(shown, count, CONFIG), 2))
+    return spread(shown, CAMERA, count, CONFIG, numbers(grid_cells(shown, count, CONFIG), 2), GAIN)
 
 
 @pytest.mark.parametrize(("count", "least"), [(300, 10), (300, 10_000), (50, 5), (1, 5)])

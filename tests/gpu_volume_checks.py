@@ -117,6 +117,11 @@ def test_noise_holes_edges_and_colours(width):
     assert_alike(*both(frames))
 
 
+@pytest.mark.parametrize("gain", [0.6, 1.5])
+def test_luminance_is_that_of_the_first_exposure_as_on_the_cpu(gain):
+    assert_alike(*both([replace(noisy_corner(c2w, CAMERA), gain=gain) for c2w in POSES]))
+
+
 def test_a_rolling_shutter_is_averaged_in_as_on_the_cpu():
     volumes = FusedVolume(*LENGTHS), GpuVolume(*LENGTHS, DEVICE)
     for volume in volumes:
@@ -278,7 +283,7 @@ def test_nothing_waits_for_the_host(monkeypatch):
     points, start = torch.zeros(64, 4, device="meta"), fusion_gpu.pack_start(torch.eye(4), 50).to("meta")
     depth, color = torch.zeros(36, 48, device="meta"), torch.zeros(36, 48, 3, dtype=torch.uint8, device="meta")
     with Forbidding():
-        fusion_gpu.fuse(blocks, listed, depth, color, torch.zeros(25, device="meta"), 4, 3)
+        fusion_gpu.fuse(blocks, listed, depth, color, torch.zeros(26, device="meta"), 4, 3)
         row = fusion_gpu.descend(blocks, points, start, tuple(stages(CONFIG)), 10, 4, RULES)
     assert row.shape == start.shape
 
@@ -385,7 +390,7 @@ def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     cells, order = grid_cells(shown, config.align.points, config), grid_cells(shown, config.tracking.rays, config)
     numbers = torch.zeros(2 * cells + 60 * (3 + 7), device=meta)
     corners, order = (torch.zeros(n, dtype=torch.int64, device=meta) for n in (20 if fus else 0, order))
-    start, rates = (torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((22,), (1, 6)))
+    start, rates = (torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((23,), (1, 6)))
     given = field, blocks, config, shown, order, rates, corners, start, numbers
     tracker._whole(*given)  # uploads the layout, once
     with Forbidding():

@@ -11,7 +11,7 @@ from ecslam.config import Config
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import Prefetch, open_sequence
 from ecslam.denoising import denoised
-from ecslam.earlier import relief, tint
+from ecslam.earlier import light, relief
 from ecslam.keyframes import make_keyframe
 from ecslam.pixels import choose_pixels, feature_points, find_corners
 from ecslam.runtime import ahead
@@ -33,11 +33,11 @@ def test_what_is_held_against_earlier_views_is_looked_at_ahead(movers, exposure)
     config = apply_settings(load_preset("live"), [f"movers={movers}", f"exposure={exposure}"])
     prepared = preparation(lambda: config, ROOM.intrinsics, "cpu")(ROOM[1])
     assert (prepared.relief is None) == (movers == "true" and exposure == "false")
-    assert (prepared.tint is None) == (exposure == "false")
+    assert (prepared.light is None) == (exposure == "false")
     if prepared.relief is not None:
         assert np.array_equal(prepared.relief, relief(prepared.depth))
-    if prepared.tint is not None:
-        assert np.array_equal(prepared.tint, tint(prepared.color), equal_nan=True)
+    if prepared.light is not None:
+        assert np.array_equal(prepared.light, light(prepared.color), equal_nan=True)
 
 
 def test_other_depth_has_another_relief():

@@ -68,9 +68,10 @@ def depth_in_range(depth, at, lens, live):
 
 
 @triton.jit
-def spread_kernel(depth, color, jitter, points, cells, lens, luminance, total, block: tl.constexpr):
+def spread_kernel(depth, color, jitter, points, cells, lens, luminance, gain, total, block: tl.constexpr):
     """A pixel in each of ``total`` cells as a row of ``points`` float32 [N, 4]: camera coordinates, all 0 without a
-    depth, and luminance. jitter: [N, 2] in 0..1; luminance: of red, green and blue in 0..255."""
+    depth, and luminance. jitter: [N, 2] in 0..1; luminance: of red, green and blue in 0..255; gain: of it, float64,
+    up to 1."""
     i = tl.program_id(0) * block + tl.arange(0, block)
     live = i < total
     u, v = pixel_in(cells, i, tl.load(jitter + 2 * i, live, 0.0), tl.load(jitter + 2 * i + 1, live, 0.0))
@@ -82,7 +83,7 @@ def spread_kernel(depth, color, jitter, points, cells, lens, luminance, total, b
     tl.store(points + 4 * i, (u - lens.cx) / lens.fx * d, live)
     tl.store(points + 4 * i + 1, (v - lens.cy) / lens.fy * d, live)
     tl.store(points + 4 * i + 2, d, live)
-    tl.store(points + 4 * i + 3, light, live)
+    tl.store(points + 4 * i + 3, tl.minimum(light * tl.load(gain).to(tl.float32), 1.0), live)
 
 
 @triton.jit

@@ -18,7 +18,7 @@ BASELINE_M, STRIDE = tl.constexpr(fusion_views.NORMAL_BASELINE_M), tl.constexpr(
 RED, GREEN, BLUE = tl.constexpr(9798), tl.constexpr(19235), tl.constexpr(3735)  # as OpenCV has them, over 2^15
 ROUNDING = tl.constexpr(1.5 * 2**23)  # a float32 added to it and taken away again is rounded, ties to even
 FX, FY, CX, CY = tl.constexpr(12), tl.constexpr(13), tl.constexpr(14), tl.constexpr(15)
-NEAR, FAR, NOW, SWEEP = tl.constexpr(16), tl.constexpr(17), tl.constexpr(18), tl.constexpr(19)
+NEAR, FAR, NOW, SWEEP, GAIN = tl.constexpr(16), tl.constexpr(17), tl.constexpr(18), tl.constexpr(19), tl.constexpr(25)
 
 
 class Listed(NamedTuple):
@@ -32,8 +32,8 @@ class Listed(NamedTuple):
 
 class View(NamedTuple):
     """One frame. depth: float32 [H, W] metres, 0 = none. light: float32 [H, W] in 0..1. normal: float32 [H / 2, W / 2,
-    3] in the camera. numbers: float64 [25]: c2w [3, 4], fx, fy, cx, cy, near and far in metres, number of the frame,
-    sweep [6] (see ``fusion_views.View``)."""
+    3] in the camera. numbers: float64 [26]: c2w [3, 4], fx, fy, cx, cy, near and far in metres, number of the frame,
+    sweep [6] (see ``fusion_views.View``), gain of the luminance, which is cut off at 1."""
 
     depth: Tensor
     light: Tensor
@@ -55,7 +55,8 @@ def read_kernel(measured, color, view, listed, block: tl.constexpr):
     green = tl.load(color + 3 * i + 1, live, 0).to(tl.int32)
     blue = tl.load(color + 3 * i + 2, live, 0).to(tl.int32)
     gray = (red * RED + green * GREEN + blue * BLUE + (1 << 14)) >> 15
-    tl.store(view.light + i, gray.to(tl.float32) * (1 / 255), live)
+    gain = tl.load(view.numbers + GAIN).to(tl.float32)
+    tl.store(view.light + i, tl.minimum(gray.to(tl.float32) * (gain / 255), 1.0), live)
     if tl.program_id(0) == 0:
         tl.store(listed.counts, 0)
 

@@ -80,12 +80,12 @@ def compare(near, lens, to_view, seen, front, came, settled):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def ratios(near, tint, lens, to_view, seen, tints, within, every, stride, out):
-    """How much brighter views saw what a frame sees: fills ``out`` float32 [3, V * h * w] with logarithms of the ratios
-    of red, green and blue, and returns how many there are.
+def ratios(near, light, lens, to_view, seen, lights, within, every, stride, out):
+    """How much brighter views saw what a frame sees: fills ``out`` float32 [V * h * w] with logarithms of the ratios,
+    and returns how many there are.
 
-    near, lens, to_view, seen: see ``compare``. tint: float32 [h, w, 3], logarithms of the cells' colours, NaN where
-    they tell nothing; tints: [V, h, w, 3], those of the views. within: float32, metres and share of the depth by which
+    near, lens, to_view, seen: see ``compare``. light: float32 [h, w], logarithms of how bright the cells are, NaN where
+    that tells nothing; lights: [V, h, w], those of the views. within: float32, metres and share of the depth by which
     what is one surface may differ. Every ``every``-th view is asked, about every ``stride``-th row and column of cells.
     """
     rows, columns = near.shape
@@ -93,7 +93,7 @@ def ratios(near, tint, lens, to_view, seen, tints, within, every, stride, out):
     found = 0
     for view in range(0, seen.shape[0], every):
         least, most = seen[view, 0].ravel(), seen[view, 1].ravel()
-        theirs = tints[view].reshape(-1, 3)
+        theirs = lights[view].ravel()
         for v in range(0, rows, stride):
             project(near[v], v, lens, to_view[view], rows, index, ahead)
             for u in range(0, columns, stride):
@@ -101,8 +101,8 @@ def ratios(near, tint, lens, to_view, seen, tints, within, every, stride, out):
                 if i >= 0 and least[i] > np.float32(0):
                     margin = within[0] + within[1] * least[i]
                     same = (ahead[u] > least[i] - margin) & (ahead[u] < most[i] + margin)
-                    if same and theirs[i, 0] - tint[v, u, 0] < np.float32(np.inf):
-                        for k in range(3):
-                            out[k, found] = theirs[i, k] - tint[v, u, k]
+                    ratio = theirs[i] - light[v, u]
+                    if same and ratio < np.float32(np.inf):
+                        out[found] = ratio
                         found += 1
     return found

@@ -29,14 +29,15 @@ TOLD = 15
 
 
 def spread(
-    color: Tensor, depth: Tensor, jitter: Tensor, cells: Cells, lens: Lens, luminance: tuple[float, ...]
+    color: Tensor, depth: Tensor, jitter: Tensor, cells: Cells, lens: Lens, luminance: tuple[float, ...], gain: Tensor
 ) -> Tensor:
     """Points float32 [N, 4] of a frame, one in each cell: camera coordinates (metres, all 0 without a usable depth) and
-    luminance. color: uint8 [H, W, 3]; depth: float32 [H, W]; jitter: [N, 2] in 0..1, down and right."""
+    luminance times ``gain`` float64 [1], at most 1. color: uint8 [H, W, 3]; depth: float32 [H, W]; jitter: [N, 2] in
+    0..1, down and right."""
     points = depth.new_empty(len(jitter), 4)
     with beside(depth):
         spread_kernel[(-(-len(jitter) // BLOCK),)](
-            depth, color, jitter, points, cells, lens, luminance, len(jitter), block=BLOCK
+            depth, color, jitter, points, cells, lens, luminance, gain, len(jitter), block=BLOCK
         )
     return points
 

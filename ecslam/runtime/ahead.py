@@ -12,7 +12,7 @@ from ..types import Frame, Intrinsics
 
 
 def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -> Callable[[Frame], Frame]:
-    """Smooth the depth of frames, look at its relief and at their tint, find the corners of those that will need them,
+    """Smooth the depth of frames, look at its relief and at their light, find the corners of those that will need them,
     make keyframes of those whose turn it will be, and put images for a GPU where it can fetch them by itself.
 
     config: asked for every frame. What is missing, or was found with other settings, is made good when it is needed.
@@ -20,7 +20,7 @@ def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -
 
     def prepare(frame: Frame) -> Frame:
         from ..denoising import denoised  # torch is not imported at the start
-        from ..earlier import relief, tint
+        from ..earlier import light, relief
         from ..keyframes import prepared
         from ..pixels import find_corners
 
@@ -29,7 +29,7 @@ def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -
         if now.exposure or not now.movers:
             frame = replace(frame, relief=relief(frame.depth))
         if now.exposure:
-            frame = replace(frame, tint=tint(frame.color))
+            frame = replace(frame, light=light(frame.color))
         turn = frame.index % now.keyframe_every == 0
         if now.fus and (now.tracking.iterations > 0 or turn):
             frame = replace(frame, corners=find_corners(frame.color, now))

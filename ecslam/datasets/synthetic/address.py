@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 from dataclasses import dataclass, replace
-from typing import Any
 from urllib.parse import parse_qsl
 
 from ...types import InputError
@@ -12,16 +11,16 @@ from ...types import InputError
 ROOMS = ("studio", "apartment", "corridor")
 PREFIX = "synthetic/"
 MAX_SIDE, MAX_FRAMES = 4096, 100_000
-MOST_READOUT_S = 1 / 30
-SWITCHES, SWITCH = ("noise", "visitor", "exposure"), {"0": False, "1": True}
-FORMS = "noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1, exposure=0|1"
+MOST_READOUT_S, MOST_EXPOSURE = 1 / 30, 0.9
+SWITCH = {"0": False, "1": True}
+FORMS = "noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1, exposure=SHARE"
 
 
 @dataclass(frozen=True)
 class Address:
     """Which room to render and how. frames: None for one round of the room's path. width, height: pixels. readout:
     seconds from an image's first row to its last (a rolling shutter). visitor: whether somebody walks through.
-    exposure: whether each image is exposed for what it shows."""
+    exposure: by which share of it brightness swings, as that of a camera that exposes by itself."""
 
     room: str
     width: int = 640
@@ -31,7 +30,7 @@ class Address:
     seed: int = 0
     readout: float = 0.0
     visitor: bool = False
-    exposure: bool = False
+    exposure: float = 0.0
 
 
 def parse_address(address: str, defaults: Address | None = None) -> Address:
@@ -63,20 +62,25 @@ def check(address: Address) -> Address:
         raise InputError(f"{where}: seed={address.seed} is negative; use 0 or more")
     if not 0 <= address.readout <= MOST_READOUT_S:
         raise InputError(f"{where}: readout={address.readout:g} is out of range; use 0 to {MOST_READOUT_S:g} seconds")
+    if not 0 <= address.exposure <= MOST_EXPOSURE:
+        raise InputError(f"{where}: exposure={address.exposure:g} is out of range; use 0 to {MOST_EXPOSURE:g}")
     return address
 
 
 def _apply(address: Address, key: str, value: str, source: str) -> Address:
     try:
-        if key in SWITCHES:
-            switched: dict[str, Any] = {key: SWITCH[value]}
-            return replace(address, **switched)
+        if key == "noise":
+            return replace(address, noise=SWITCH[value])
+        if key == "visitor":
+            return replace(address, visitor=SWITCH[value])
         if key == "frames":
             return replace(address, frames=int(value))
         if key == "seed":
             return replace(address, seed=int(value))
         if key == "readout":
             return replace(address, readout=float(value))
+        if key == "exposure":
+            return replace(address, exposure=float(value))
         if key == "size":
             width, height = value.split("x")
             return replace(address, width=int(width), height=int(height))

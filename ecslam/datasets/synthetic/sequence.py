@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ...types import Frame, Intrinsics, Mesh
 from .address import PREFIX, Address, check, parse_address
-from .exposing import exposed
 from .lighting import bake
 from .mesh import reference_mesh
 from .noise import kinect
@@ -30,6 +29,7 @@ RATE_HZ = 30.0
 FOCAL = 0.8
 MARGIN_M = 0.05
 STRIPS = 24
+SWING_FRAMES = 50  # from one brightest image to the next
 PATH_SEED = 1
 
 _baking = threading.Lock()
@@ -63,7 +63,7 @@ def open_synthetic(
     seed: int = 0,
     readout: float = 0.0,
     visitor: bool = False,
-    exposure: bool = False,
+    exposure: float = 0.0,
 ) -> SyntheticSequence:
     """Open a built-in room: ``studio``, ``apartment`` or ``corridor``, also as an address with options (see address).
 
@@ -106,7 +106,8 @@ class SyntheticSequence:
         if feet is not None:
             color, depth = with_visitor(color, depth, self.intrinsics, c2w, feet)
         if self.address.exposure:
-            color = exposed(color)
+            gain = 1 + self.address.exposure * np.sin(2 * np.pi * index / SWING_FRAMES)
+            color = np.rint(np.minimum(color * np.float32(gain), 255)).astype(np.uint8)
         if self.address.noise:
             color, depth = kinect(color, depth, self.intrinsics, np.random.default_rng([self.address.seed, index]))
         return Frame(index, index / RATE_HZ, color, depth, c2w.copy())
