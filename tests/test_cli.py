@@ -41,7 +41,7 @@ SETTINGS = {
 SUMMARY_KEYS = {
     "sequence", "preset", "device", "kernels", "seed", "frames", "keyframes", "wall_s", "fps_wall", "fps_engine",
     "ate_rmse_cm", "ate_mean_cm", "ate_max_cm", "parameters", "parameters_mb", "peak_memory_mb", "skipped_frames",
-    "lost_frames", "loop_closures", "finished",
+    "lost_frames", "loop_closures", "ended", "error",
 }  # fmt: skip
 EMPTY = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
 EVALUATED_KEYS = {"depth_l1_cm", "accuracy_cm", "completion_cm", "completion_ratio"}
