@@ -87,9 +87,9 @@ class Follower:
         return Expected(trajectory.predict(frame.timestamp) if known else trajectory[-1], known, gap)
 
     def exposed(self, frame: Frame, expected: Expected, trajectory: Trajectory, config: Config) -> Frame:
-        """The frame with the gain that makes it as bright as if it were exposed as the first one; that of the frame
-        before where it is not known what earlier keyframes saw of it."""
-        if not config.exposure:
+        """The frame with the gain that makes it as bright as if it were exposed as the first one, as the fused volume
+        is; that of the frame before where it is not known what earlier keyframes saw of it."""
+        if not config.exposure or self._volume is None:
             return frame
         if not expected.known:
             return replace(frame, gain=self._gain)
