@@ -6,6 +6,7 @@ import json
 from concurrent.futures import Future, ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,8 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     if 0 < saved < done:
         console.print(f"  note: the newest checkpoint holds {saved} of the {done} frames done", soft_wrap=True)
     if not (folder / "mesh.ply").is_file():
-        text = f"  no mesh.ply yet: ecslam mesh {folder} makes it, or ecslam resume {folder} goes on with the run"
+        named = quote(str(folder))
+        text = f"  no mesh.ply yet: ecslam mesh {named} makes it, or ecslam resume {named} goes on with the run"
         if not saved:
             text = "  no mesh.ply and no checkpoint yet, so there is nothing to go on from: start again with ecslam run"
         console.print(text, soft_wrap=True)
@@ -92,7 +94,8 @@ def _require_saved(folder: Path, not_saved: dict[str, str], to_go_on: bool) -> N
     checkpoint."""
     lacking = [name for name in FINAL if name in not_saved]
     if lacking:
-        onward = f"ecslam {'mesh' if lacking == ['mesh.ply'] else 'resume'} {folder}" if to_go_on else "ecslam run"
+        command = "mesh" if lacking == ["mesh.ply"] else "resume"
+        onward = f"ecslam {command} {quote(str(folder))}" if to_go_on else "ecslam run"
         raise InputError(
             f"{folder}: {', '.join(lacking)} could not be saved ({not_saved[lacking[0]]}); make room, then: {onward}"
         )

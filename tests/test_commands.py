@@ -62,6 +62,15 @@ def test_a_run_that_was_left_before_its_first_checkpoint_is_to_be_started_again(
     assert not any(command in said for command in ("ecslam mesh", "ecslam resume"))
 
 
+def test_commands_that_are_told_can_be_copied(tmp_path, capsys):
+    with running(tmp_path / "my run", paused_at=6) as (engine, _, __):
+        engine.submit(Quit())
+        assert engine.join(10)
+        reports.finish_run(engine.run_folder, engine.summary)
+    told = capsys.readouterr().out.replace("\n", " ")
+    assert f"ecslam resume '{tmp_path}/my run' goes on" in told
+
+
 @pytest.mark.parametrize(("state", "frames"), [(State.TRACKING, 100_000), (State.FINISHED, 4)])
 def test_a_run_that_a_signal_cuts_short_is_saved_and_has_its_status(tmp_path, monkeypatch, state, frames):
     def interrupt(snapshot, *_, **__):

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from time import monotonic
 from typing import Any
 
@@ -89,7 +90,7 @@ class Engine:
         the address in ``run.json``. Raises InputError."""
         checkpoint = load_checkpoint(folder / "checkpoints")
         if checkpoint.meta["finished"] and (folder / "summary.json").is_file():
-            raise InputError(f"{folder}: this run is finished; look at it with: ecslam view {folder}")
+            raise InputError(f"{folder}: this run is finished; look at it with: ecslam view {quote(str(folder))}")
         config = config_files.apply(Config(), checkpoint.meta["config"], str(folder))
         opened = sequence or checkpoint.meta["sequence"]
         return cls(config, opened, folder, frames=checkpoint.meta["frames"], resumed=checkpoint, **options)

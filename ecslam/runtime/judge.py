@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, TypeError) as error:
-        onward = f"remove it, and make it again with: ecslam resume {path.parent}"
+        onward = f"remove it, and make it again with: ecslam resume {quote(str(path.parent))}"
         raise InputError(f"{path}: cannot be read ({words(error)}); {onward}") from None
 
 
@@ -122,7 +123,7 @@ def read_truth(folder: Path, times: NDArray[np.float64]) -> NDArray[np.float64] 
 
 def read_mesh(path: Path) -> Mesh:
     """A mesh file of ours. Raises NoSurface where there is none or an empty one, InputError for a damaged one."""
-    mend = f"make it with: ecslam mesh {path.parent}"
+    mend = f"make it with: ecslam mesh {quote(str(path.parent))}"
     if not path.is_file():
         raise NoSurface(f"{path}: no mesh here; {mend}")
     return load_mesh(path, mend)

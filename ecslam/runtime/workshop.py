@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from shlex import quote
 
 import numpy as np
 
@@ -143,7 +144,7 @@ class Workshop:
 
 
 def _without_mesh(run: Run, why: str = "") -> str:
-    return f"mesh.ply was not made{why}; make it with: ecslam mesh {run.folder.path}"
+    return f"mesh.ply was not made{why}; make it with: ecslam mesh {quote(str(run.folder.path))}"
 
 
 def _freeze(run: Run) -> FrozenMap:
