@@ -18,6 +18,14 @@ from ecslam.interrupts import interrupts_held
 INTERRUPT = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(20)\n"
 
 
+@pytest.fixture(autouse=True)
+def heeded():
+    """Where the tests were started in the background, SIGINT is ignored, also in what they start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def swallow(*_, **__):
     with contextlib.suppress(BaseException):
         signal.raise_signal(signal.SIGINT)
