@@ -45,7 +45,7 @@ class EarlierViews:
     def remember(self, frame: Frame, keyframe: int) -> None:
         """Keep what a frame saw that is the keyframe number ``keyframe``."""
         self._seen = [*self._seen, around(relief_of(frame))][-KEPT:]
-        self._lights = [*self._lights, light_of(frame) + np.float32(np.log(frame.gain))][-KEPT:]
+        self._lights = [*self._lights, _at_first(light_of(frame), frame.gain)][-KEPT:]
         self._keyframes = [*self._keyframes, keyframe][-KEPT:]
         self._ask()
 
@@ -92,12 +92,17 @@ def relief(depth: NDArray[np.float32]) -> Cells:
 
 
 def light(color: NDArray[np.uint8]) -> Cells:
-    """The logarithm of the mean luminance of each cell [h, w] of an image; NaN where that is too dark or too bright."""
+    """The logarithm of the mean luminance of each cell [h, w] of an image; 0 where that is too dark or too bright."""
     cell = cell_px(color.shape[1])
     height, width = (side // cell for side in color.shape[:2])
     small = cv2.resize(color[: height * cell, : width * cell], (width, height), interpolation=cv2.INTER_AREA)
     mean = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-    return np.log(np.where((mean >= DARK) & (mean <= BRIGHT), mean, np.nan), dtype=np.float32)
+    return np.log(np.where((mean >= DARK) & (mean <= BRIGHT), mean, 1), dtype=np.float32)
+
+
+def _at_first(seen: Cells, gain: float) -> Cells:
+    """What would have been seen at the exposure of the first frame, see ``light``; no gain makes it 0."""
+    return np.where(seen > 0, seen + np.float32(np.log(gain)), np.float32(0))
 
 
 def around(seen: Cells) -> NDArray[np.float32]:

@@ -37,7 +37,7 @@ def test_what_is_held_against_earlier_views_is_looked_at_ahead(movers, exposure)
     if prepared.relief is not None:
         assert np.array_equal(prepared.relief, relief(prepared.depth))
     if prepared.light is not None:
-        assert np.array_equal(prepared.light, light(prepared.color), equal_nan=True)
+        assert np.array_equal(prepared.light, light(prepared.color))
 
 
 def test_other_depth_has_another_relief():

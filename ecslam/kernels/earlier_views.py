@@ -84,7 +84,7 @@ def ratios(near, light, lens, to_view, seen, lights, within, every, stride, out)
     """How much brighter views saw what a frame sees: fills ``out`` float32 [V * h * w] with logarithms of the ratios,
     and returns how many there are.
 
-    near, lens, to_view, seen: see ``compare``. light: float32 [h, w], logarithms of how bright the cells are, NaN where
+    near, lens, to_view, seen: see ``compare``. light: float32 [h, w], logarithms of how bright the cells are, 0 where
     that tells nothing; lights: [V, h, w], those of the views. within: float32, metres and share of the depth by which
     what is one surface may differ. Every ``every``-th view is asked, about every ``stride``-th row and column of cells.
     """
@@ -101,8 +101,7 @@ def ratios(near, light, lens, to_view, seen, lights, within, every, stride, out)
                 if i >= 0 and least[i] > np.float32(0):
                     margin = within[0] + within[1] * least[i]
                     same = (ahead[u] > least[i] - margin) & (ahead[u] < most[i] + margin)
-                    ratio = theirs[i] - light[v, u]
-                    if same and ratio < np.float32(np.inf):
-                        out[found] = ratio
+                    if same and theirs[i] > np.float32(0) and light[v, u] > np.float32(0):
+                        out[found] = theirs[i] - light[v, u]
                         found += 1
     return found
