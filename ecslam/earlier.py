@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .kernels import earlier_views
+from .rigid import inverse
 from .types import Frame, Intrinsics
 
 COLUMNS, SAMPLES = 64, 4  # cells in a row of the image, and pixels of a cell's row or column whose depth is looked at
@@ -80,6 +81,11 @@ def cell_lens(camera: Intrinsics, cell: int) -> tuple[float, float, float, float
     """fx, fy, cx, cy of a camera whose pixels are the cells."""
     middle = (cell - 1) / 2
     return camera.fx / cell, camera.fy / cell, (camera.cx - middle) / cell, (camera.cy - middle) / cell
+
+
+def to_views(c2w: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Motions [V, 3, 4] from the coordinates of a camera at c2w [4, 4] to those of views from ``poses`` [V, 4, 4]."""
+    return (inverse(poses) @ c2w)[:, :3].astype(np.float32)
 
 
 def relief(depth: NDArray[np.float32]) -> Cells:

@@ -11,9 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .earlier import Views, cell_lens, cell_px, light_of, relief_of
+from .earlier import Views, cell_lens, cell_px, light_of, relief_of, to_views
 from .kernels import earlier_views
-from .rigid import inverse
 from .types import Frame, Intrinsics
 
 EVERY, SPARSE = 2, 2  # each which of the views that are asked, and each which of the frame's rows and columns of cells
@@ -45,7 +44,7 @@ def _gain(
     if not keyframes:
         return None
     near, cell = relief_of(frame), cell_px(frame.depth.shape[1])
-    to_view = (inverse(keyframe_poses[keyframes]) @ c2w)[:, :3].astype(np.float32)
+    to_view = to_views(c2w, keyframe_poses[keyframes])
     lens, within = (np.array(n, np.float32) for n in (cell_lens(camera, cell), (WITHIN_M, WITHIN_PER_M)))
     ratios = np.empty(len(keyframes) * near.size, np.float32)
     found = earlier_views.ratios(near, light_of(frame), lens, to_view, seen, lights, within, EVERY, SPARSE, ratios)

@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .earlier import Cells, Views, cell_lens, cell_px, relief_of
+from .earlier import Cells, Views, cell_lens, cell_px, relief_of, to_views
 from .kernels import earlier_views
-from .rigid import inverse
 from .types import Frame, Intrinsics
 
 FRONT_M, FRONT_PER_M = 0.1, 0.03  # a point has come that is so much nearer than what was seen
@@ -58,9 +57,8 @@ def compare(
     from ``poses`` [V, 4, 4].
     """
     came, settled = np.zeros((2, *near.shape), np.bool_)
-    to_view = (inverse(poses) @ c2w)[:, :3].astype(np.float32)
     front = np.array([FRONT_M, FRONT_PER_M], np.float32)
-    earlier_views.compare(near, np.array(lens, np.float32), to_view, seen, front, came, settled)
+    earlier_views.compare(near, np.array(lens, np.float32), to_views(c2w, poses), seen, front, came, settled)
     return came, settled
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from remembered import remembering
 
 from ecslam.align import known_points
 from ecslam.config_files import apply_settings, load_preset
@@ -23,14 +24,6 @@ LIVE = load_preset("live")
 def lit(frame: Frame, *factors: float) -> Frame:
     """The frame as a camera would take it that exposes it for so much longer."""
     return replace(frame, color=np.rint(np.minimum(frame.color * np.array(factors), 255)).astype(np.uint8))
-
-
-def remembering(frames: list[Frame]) -> tuple[EarlierViews, np.ndarray]:
-    """What is remembered of these frames as keyframes, and the poses of these."""
-    earlier = EarlierViews()
-    for number, frame in enumerate(frames):
-        earlier.remember(frame, number)
-    return earlier, np.stack([frame.c2w_gt for frame in frames])
 
 
 EARLIER, POSES = remembering([ROOM[i] for i in range(0, 30, 5)])

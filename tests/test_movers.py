@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from remembered import remembering
 
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
@@ -31,14 +32,6 @@ def walked_through(frame: Frame, left: int, width: int = 40, depth_m: float = 0.
         depth=np.where(there, np.float32(depth_m), frame.depth),
         color=np.where(there[..., None], stripes, frame.color).astype(np.uint8),
     )
-
-
-def remembering(frames: list[Frame]) -> tuple[EarlierViews, np.ndarray]:
-    """What is remembered of these frames as keyframes, and the poses of these."""
-    earlier = EarlierViews()
-    for number, frame in enumerate(frames):
-        earlier.remember(frame, number)
-    return earlier, np.stack([frame.c2w_gt for frame in frames])
 
 
 def left_of(frame: Frame, c2w: np.ndarray, earlier: EarlierViews, poses: np.ndarray) -> Frame:
