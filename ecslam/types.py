@@ -66,6 +66,20 @@ class Intrinsics:
 
 
 @dataclass(frozen=True)
+class Calibration:
+    """What a depth camera is really like, where a recording says otherwise.
+
+    camera: the pinhole camera. radial: a pixel that ``camera`` puts on the ray (x, y, 1) saw along (s x, s y, 1), where
+    s = 1 + radial (x^2 + y^2). inverse_depth: 1/m, added to the inverse of every measured depth, as an error of
+    disparity is.
+    """
+
+    camera: Intrinsics
+    radial: float = 0.0
+    inverse_depth: float = 0.0
+
+
+@dataclass(frozen=True)
 class Corners:
     """Corners of an image. index: int64 [K], flat pixel indices, strongest first. settings: by what they were found."""
 
