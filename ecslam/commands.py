@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from . import config_files, datasets
 from .atomic import write_atomic
 from .config import Config
+from .datasets.addresses import lasting_address
 from .datasets.roots import sequences_under
 from .messages import Notice, Quit, Snapshot
 from .reports import Reports, console, finish_run
@@ -104,14 +105,6 @@ def make_engine(
     return Engine(
         config, address, out, device=device, frames=frames, sequences=(address, *offers), open_sequence=open_again
     )
-
-
-def lasting_address(address: str) -> str:
-    """The address of a sequence as it can be opened from any folder."""
-    if address.startswith("synthetic/"):
-        return address
-    path = datasets.split_address(address)[0]
-    return str(Path(path).expanduser().resolve()) + address.removeprefix(path)
 
 
 def resume_engine(folder: Path, device: str, sequence: str | None) -> Engine:

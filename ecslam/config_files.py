@@ -7,10 +7,8 @@ out of range is an ``InputError`` that names the key and suggests the nearest on
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import re
-import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -21,48 +19,8 @@ from typing import Any, Literal
 import yaml
 
 from .config import Config
+from .strict_yaml import is_number, kind_of, nearest, parse_yaml
 from .types import InputError
-
-MAX_CONFIG_BYTES = 64 * 1024
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """YAML without aliases and duplicate keys, and with ``1e-3`` read as the number it looks like."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.events.AliasEvent):
-            raise yaml.YAMLError("aliases (*name) are not allowed")
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if key in seen:
-                raise yaml.YAMLError(f"the key {key!r} stands twice (line {key_node.start_mark.line + 1})")
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-_StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
-    list("-+0123456789."),
-)
-
-
-def parse_yaml(text: str, source: str) -> Any:
-    """Parse strict YAML. Raises InputError naming ``source``."""
-    if len(text) > MAX_CONFIG_BYTES:
-        raise InputError(
-            f"{source}: over {MAX_CONFIG_BYTES // 1024} KiB, which no configuration needs; is it the right file?"
-        )
-    try:
-        return yaml.load(text, _StrictLoader)
-    except (yaml.YAMLError, ValueError, TypeError) as error:
-        raise InputError(f"{source}: not valid YAML: {' '.join(str(error).split())}") from None
-    except RecursionError:
-        raise InputError(f"{source}: nested too deeply for a configuration; is it the right file?") from None
 
 
 def config_folder() -> Path:
@@ -81,7 +39,7 @@ def load_preset(name: str) -> Config:
     path = config_folder() / f"{name}.yaml"
     if not re.fullmatch(r"[\w-]+", name) or not path.is_file():
         raise InputError(
-            f"preset {name!r}: no such preset{_suggest(name, preset_names())}; there are: {', '.join(preset_names())}"
+            f"preset {name!r}: no such preset{nearest(name, preset_names())}; there are: {', '.join(preset_names())}"
         )
     return apply(Config(preset=name), parse_yaml(path.read_text("utf-8"), str(path)) or {}, str(path))
 
@@ -163,7 +121,9 @@ def _merged(under: Any, over: Any) -> Any:
 
 def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
     if not isinstance(values, Mapping):
-        raise InputError(f"{source}: {prefix.rstrip('.') or 'the file'} must hold keys and values, not {_kind(values)}")
+        raise InputError(
+            f"{source}: {prefix.rstrip('.') or 'the file'} must hold keys and values, not {kind_of(values)}"
+        )
     hints = typing.get_type_hints(type(node))
     by_name = {f.name: f for f in fields(node)}
     laid: dict[str, Any] = {}
@@ -171,7 +131,7 @@ def _apply(node: Any, values: Any, source: str, prefix: str) -> Any:
         path = f"{prefix}{key}"
         if key not in by_name:
             known = _all_keys(Config)
-            advice = f"; write it as {_nested(path)}" if path in known else _suggest(path, known)
+            advice = f"; write it as {_nested(path)}" if path in known else nearest(path, known)
             raise InputError(f"{source}: unknown key {path!r}{advice}")
         current = getattr(node, key)
         if is_dataclass(current):
@@ -197,31 +157,22 @@ def _convert(value: Any, hint: Any, limits: Mapping[str, Any], source: str, path
             raise InputError(f"{source}: {path} must be one of {', '.join(map(str, options))}, not {value!r}")
         return value
     if origin is tuple:
-        if not isinstance(value, (list, tuple)) or not all(_is_number(v) for v in value):
-            raise InputError(f"{source}: {path} must be a list of numbers, not {_kind(value)} {value!r}")
+        if not isinstance(value, (list, tuple)) or not all(is_number(v) for v in value):
+            raise InputError(f"{source}: {path} must be a list of numbers, not {kind_of(value)} {value!r}")
         return tuple(float(v) for v in value)
     wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}[hint]
     ok = {
         int: isinstance(value, int) and not isinstance(value, bool),
-        float: _is_number(value),
+        float: is_number(value),
         bool: isinstance(value, bool),
         str: isinstance(value, str),
     }[hint]
     if not ok:
-        raise InputError(f"{source}: {path} must be {wanted}, not {_kind(value)} {value!r}")
+        raise InputError(f"{source}: {path} must be {wanted}, not {kind_of(value)} {value!r}")
     low, high = limits.get("low", -math.inf), limits.get("high", math.inf)
     if hint in (int, float) and not low <= value <= high:
         raise InputError(f"{source}: {path} = {value} is out of range; it must lie in {low:g} .. {high:g}")
     return float(value) if hint is float else value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-
-
-def _kind(value: Any) -> str:
-    names = {dict: "a group of keys", list: "a list", str: "text", bool: "true/false", type(None): "nothing"}
-    return names.get(type(value), "the number" if isinstance(value, (int, float)) else type(value).__name__)
 
 
 def _all_keys(node: type, prefix: str = "") -> list[str]:
@@ -238,10 +189,3 @@ def _nested(path: str) -> str:
     """How YAML writes a dotted key that stands for a group and a key of it."""
     group, _, key = path.partition(".")
     return f"{group}: {{{_nested(key)}}}" if key else f"{group}: ..."
-
-
-def _suggest(word: str, options: list[str]) -> str:
-    near = difflib.get_close_matches(word, options, 1, 0.6)
-    if not near:
-        near = [o for o in options if o.rsplit(".", 1)[-1] == word.rsplit(".", 1)[-1]][:1]
-    return f"; did you mean {near[0]!r}?" if near else ""

@@ -9,6 +9,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from ecslam.datasets import open_sequence, problems, registry, select_frames
 from ecslam.datasets.check import check_sequence, format_report
 from ecslam.datasets.reading import rigid
+from ecslam.datasets.synthetic import Address
 from ecslam.datasets.tum import associate, interpolate_poses
 from ecslam.types import FrameError, InputError, Sequence
 
@@ -326,7 +328,7 @@ def test_a_readout_that_no_camera_has_is_refused(folder: Path, given: str) -> No
 
 
 def test_another_option_is_refused_by_its_name(layout: str, folder: Path) -> None:
-    taken = "readout, color, depth" if layout == "rosbag" else "readout"
+    taken = "readout, calibration" + (", color, depth" if layout == "rosbag" else "")
     with pytest.raises(InputError, match=f"no option 'read'; {taken} can follow"):
         open_sequence(f"{folder}?read=0.03")
 
@@ -374,11 +376,11 @@ def test_the_error_for_an_unknown_folder_lists_every_layout(tmp_path: Path) -> N
 
 
 def test_built_in_rooms_go_to_their_own_opener_with_their_options(monkeypatch: pytest.MonkeyPatch) -> None:
-    def opener(name: str, **options: object) -> tuple[str, dict[str, object]]:
-        return name, options
+    def opener(name: str, **options: object) -> SimpleNamespace:
+        return SimpleNamespace(address=Address(name), options=options)
 
     monkeypatch.setattr(importlib.import_module("ecslam.datasets.synthetic"), "open_synthetic", opener, raising=False)
-    assert open_sequence("synthetic/studio", width=320) == ("studio", {"width": 320})  # type: ignore[comparison-overlap]
+    assert open_sequence("synthetic/studio", width=320) == opener("studio", width=320)  # type: ignore[comparison-overlap]
     with pytest.raises(InputError, match="width"):
         open_sequence("some/folder", width=320)
 

@@ -18,7 +18,7 @@ else:
 ROOT = Path(__file__).parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 LAYERS = (
-    ("types", "messages", "config", "config_files"),
+    ("types", "messages", "config", "config_files", "strict_yaml"),
     ("rigid", "indices", "compiled", "atomic", "cores", "interrupts"),
     ("se3",),
     ("kernels",),
@@ -62,7 +62,7 @@ LAYERS = (
 )
 DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "tomllib": "tomli", "yaml": "pyyaml"}
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
-GROUND = {"types", "messages", "config", "indices", "compiled", "atomic", "cores", "interrupts"}
+GROUND = {"types", "messages", "config", "strict_yaml", "indices", "compiled", "atomic", "cores", "interrupts"}
 
 
 def module_name(path: Path) -> str:

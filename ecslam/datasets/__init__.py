@@ -1,7 +1,16 @@
 """Sequences of RGB-D images: one file a layout, opened by ``open_sequence`` without saying which it is."""
 
+from .addresses import lasting_address, split_address
 from .prefetch import Prefetch
-from .registry import open_sequence, split_address
+from .registry import calibration_place, open_sequence
 from .views import problems, select_frames
 
-__all__ = ["Prefetch", "open_sequence", "problems", "select_frames", "split_address"]
+__all__ = [
+    "Prefetch",
+    "calibration_place",
+    "lasting_address",
+    "open_sequence",
+    "problems",
+    "select_frames",
+    "split_address",
+]

@@ -12,6 +12,25 @@ from numpy.typing import NDArray
 from ..types import Intrinsics
 
 
+class LookUp:
+    """Images whose pixels are looked up in others, at x and y: [H, W], pixels; 0 outside. Held in OpenCV's fast
+    fixed-point form."""
+
+    def __init__(self, x: NDArray[Any], y: NDArray[Any]) -> None:
+        x, y = x.astype(np.float32), y.astype(np.float32)
+        self._fixed, self._fraction = cv2.convertMaps(x, y, cv2.CV_16SC2)
+        self._rounded, _ = cv2.convertMaps(x, y, cv2.CV_16SC2, nninterpolation=True)
+
+    def color(self, color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Colour [H, W, 3], interpolated linearly."""
+        return np.asarray(cv2.remap(color, self._fixed, self._fraction, cv2.INTER_LINEAR), np.uint8)
+
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth [H, W] of the nearest pixel: every pixel has a value that was measured."""
+        flat = cv2.remap(depth, self._rounded, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
+        return np.asarray(flat, np.float32)
+
+
 class Lens:
     """Of one camera; an ideal pinhole leaves images as they are."""
 
@@ -20,23 +39,13 @@ class Lens:
 
     def straight_color(self, color: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Colour [H, W, 3] without distortion."""
-        if not self._camera.distortion:
-            return color
-        fixed, fraction, _ = self._maps
-        return np.asarray(cv2.remap(color, fixed, fraction, cv2.INTER_LINEAR), np.uint8)
+        return self._straight.color(color) if self._camera.distortion else color
 
     def straight_depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth [H, W] without distortion: every pixel has a value that was measured."""
-        if not self._camera.distortion:
-            return depth
-        flat = cv2.remap(depth, self._maps[2], None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-        return np.asarray(flat, np.float32)
+        """Depth [H, W] without distortion."""
+        return self._straight.depth(depth) if self._camera.distortion else depth
 
     @cached_property
-    def _maps(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """In OpenCV's fast fixed-point form: two for linear colour, one, rounded, for nearest depth."""
+    def _straight(self) -> LookUp:
         k, size = self._camera.matrix(), (self._camera.width, self._camera.height)
-        x, y = cv2.initUndistortRectifyMap(k, np.array(self._camera.distortion), None, k, size, cv2.CV_32FC1)
-        fixed, fraction = cv2.convertMaps(x, y, cv2.CV_16SC2)
-        rounded, _ = cv2.convertMaps(x, y, cv2.CV_16SC2, nninterpolation=True)
-        return fixed, fraction, rounded
+        return LookUp(*cv2.initUndistortRectifyMap(k, np.array(self._camera.distortion), None, k, size, cv2.CV_32FC1))

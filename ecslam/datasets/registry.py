@@ -9,24 +9,24 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast
-from urllib.parse import parse_qsl
 
 from ..types import InputError, Sequence
+from .addresses import CALIBRATION, COMMON, NONE, READOUT, SYNTHETIC, absolute, split_address
+from .calibration import FILE, calibrated_by
 from .views import with_readout
 
-SYNTHETIC = "synthetic/"
-READOUT, MOST_READOUT_S = "readout", 0.1
+MOST_READOUT_S = 0.1
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
 MOST_TRIED = 100
 
 
 class Layout(Protocol):
     """A module of this folder that knows one way of laying a sequence out on disk. ``OPTIONS``, if it has any: what may
-    follow a ``?`` after the path beside ``READOUT``, which ``open`` takes by these names."""
+    follow a ``?`` after the path beside ``COMMON``, which ``open`` takes by these names."""
 
     __name__: str
     __doc__: str | None
@@ -56,6 +56,8 @@ def open_sequence(path_or_address: str | Path, **synthetic_options: Any) -> Sequ
     """Open a folder or file of any known layout, or a built-in room such as ``synthetic/studio``.
 
     ``?readout=SECONDS`` after a path says how long its camera takes from the first row of depth to the last.
+    ``?calibration=FILE`` names what the camera is really like (see ``calibration``), after the name of a room, too; a
+    path without it takes ``calibration_place``, where there is such a file, and none with ``?calibration=none``.
     ``synthetic_options`` go to the built-in rooms (image size, number of frames ...). Raises InputError, in one line,
     when there is no such folder, it is laid out in no known way, or its parts do not belong together.
     """
@@ -63,31 +65,33 @@ def open_sequence(path_or_address: str | Path, **synthetic_options: Any) -> Sequ
     if address.startswith(SYNTHETIC):
         from .synthetic import open_synthetic
 
-        return cast(Sequence, open_synthetic(address.removeprefix(SYNTHETIC), **synthetic_options))
+        room = open_synthetic(address.removeprefix(SYNTHETIC), **synthetic_options)
+        given = room.address.calibration
+        return _as_told(cast(Sequence, room), address, {} if given is None else {CALIBRATION: given})
     if synthetic_options:
         raise InputError(
             f"{address}: {', '.join(synthetic_options)} can be set for {SYNTHETIC}... only, not for a folder"
         )
     try:
         path, options = split_address(address)
-        return _open_path(_resolve(path), options)
+        return _open_path(absolute(path), options)
     except OSError as error:
         raise InputError(f"{address}: cannot be opened ({error.strerror}); give a readable folder") from None
 
 
-def split_address(address: str) -> tuple[str, dict[str, str]]:
-    """The path of a recording, and the options that follow it after ``?``."""
-    path, mark, query = address.rpartition("?")
-    if not mark or os.path.exists(address):
-        return address, {}
-    return path, dict(parse_qsl(query, keep_blank_values=True))
+def calibration_place(address: str) -> Path:
+    """The calibration that a recording has by itself, whether it exists or not: in its folder, or beside its file.
+
+    Raises InputError for a built-in room.
+    """
+    path = split_address(address)[0]
+    if path.startswith(SYNTHETIC):
+        raise InputError(f"{path}: a built-in room has no folder for a calibration; name a file with --out")
+    return _place_beside(absolute(path))
 
 
-def _resolve(address: str) -> Path:
-    try:
-        return Path(address).expanduser().resolve()
-    except (ValueError, RuntimeError) as error:  # a null character; ~nobody; a loop of links
-        raise InputError(f"{address!r}: not a path ({error}); give the folder of a sequence") from None
+def _place_beside(path: Path) -> Path:
+    return path.with_name(f"{path.name}.{FILE}") if path.is_file() else path / FILE
 
 
 def _open_path(path: Path, options: dict[str, str]) -> Sequence:
@@ -101,15 +105,26 @@ def _open_path(path: Path, options: dict[str, str]) -> Sequence:
     if layout is None:
         raise InputError(_why_unknown(path))
     taken = getattr(layout, "OPTIONS", ())
-    wrong = next((name for name in options if name not in (READOUT, *taken)), None)
+    wrong = next((name for name in options if name not in (*COMMON, *taken)), None)
     if wrong is not None:
-        raise InputError(f"{path}: takes no option {wrong!r}; {', '.join((READOUT, *taken))} can follow the path")
-    given = options.pop(READOUT, None)
-    sequence = layout.open(path, **options)
-    return sequence if given is None else with_readout(sequence, _read_readout(path, given))
+        raise InputError(f"{path}: takes no option {wrong!r}; {', '.join((*COMMON, *taken))} can follow the path")
+    sequence = layout.open(path, **{name: value for name, value in options.items() if name not in COMMON})
+    beside = _place_beside(path)
+    return _as_told(sequence, path, ({CALIBRATION: str(beside)} if beside.exists() else {}) | options)
 
 
-def _read_readout(path: Path, given: str) -> float:
+def _as_told(sequence: Sequence, place: Path | str, options: Mapping[str, str]) -> Sequence:
+    """The sequence at ``place`` with what those of ``options`` that are ``COMMON`` say of its camera. Raises
+    InputError."""
+    calibration, readout = options.get(CALIBRATION, NONE), options.get(READOUT)
+    if not calibration:
+        raise InputError(f"{place}: {CALIBRATION}=: name a file, or {NONE} to leave out the one that lies there")
+    if calibration != NONE:
+        sequence = calibrated_by(sequence, absolute(calibration))
+    return sequence if readout is None else with_readout(sequence, _read_readout(place, readout))
+
+
+def _read_readout(path: Path | str, given: str) -> float:
     """Seconds from the first row of a depth image to its last. Raises InputError."""
     try:
         seconds = float(given)

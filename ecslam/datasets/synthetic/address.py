@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import difflib
 from dataclasses import dataclass, replace
-from urllib.parse import parse_qsl
 
 from ...types import InputError
+from ..addresses import SYNTHETIC, parse_options
 
 ROOMS = ("studio", "apartment", "corridor")
-PREFIX = "synthetic/"
+PREFIX = SYNTHETIC
 MAX_SIDE, MAX_FRAMES = 4096, 100_000
 MOST_READOUT_S, MOST_EXPOSURE = 1 / 30, 0.9
 SWITCH = {"0": False, "1": True}
-FORMS = "noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1, exposure=SHARE"
+FORMS = "noise=0|1, frames=N, size=WxH, seed=N, readout=SECONDS, visitor=0|1, exposure=SHARE, calibration=FILE"
 
 
 @dataclass(frozen=True)
 class Address:
     """Which room to render and how. frames: None for one round of the room's path. width, height: pixels. readout:
     seconds from an image's first row to its last (a rolling shutter). visitor: whether somebody walks through.
-    exposure: by which share of it brightness swings, as that of a camera that exposes by itself."""
+    exposure: by which share of it brightness swings, as that of a camera that exposes by itself. calibration: the
+    file of the camera that it is taken to be seen by, though it is not."""
 
     room: str
     width: int = 640
@@ -31,6 +32,7 @@ class Address:
     readout: float = 0.0
     visitor: bool = False
     exposure: float = 0.0
+    calibration: str | None = None
 
 
 def parse_address(address: str, defaults: Address | None = None) -> Address:
@@ -44,7 +46,7 @@ def parse_address(address: str, defaults: Address | None = None) -> Address:
         hint = f"did you mean {PREFIX}{near[0]}?" if near else f"choose from {', '.join(PREFIX + r for r in ROOMS)}"
         raise InputError(f"{PREFIX}{name}: no such built-in room; {hint}")
     out = replace(defaults or Address(name), room=name)
-    for key, value in parse_qsl(query, keep_blank_values=True):
+    for key, value in parse_options(query):
         out = _apply(out, key, value, address)
     return check(out)
 
@@ -81,6 +83,8 @@ def _apply(address: Address, key: str, value: str, source: str) -> Address:
             return replace(address, readout=float(value))
         if key == "exposure":
             return replace(address, exposure=float(value))
+        if key == "calibration":
+            return replace(address, calibration=value)
         if key == "size":
             width, height = value.split("x")
             return replace(address, width=int(width), height=int(height))
