@@ -210,6 +210,27 @@ def check(sequence: SequenceArgument) -> None:
         raise InputError(f"{sequence}: none of the {report.frames_read} frames tried can be read; the report says why")
 
 
+@app.command()
+def calibrate(
+    sequence: SequenceArgument,
+    frames: Annotated[
+        str, typer.Option(metavar="A:B:STEP", help="Which frames, as a Python slice; default: the first 600.")
+    ] = "0:600",
+    out: Annotated[
+        Path | None, typer.Option(help="File to write; default: where the recording finds it by itself.")
+    ] = None,
+    device: Device = "auto",
+) -> None:
+    """Find out from a recording what its depth camera is really like, and keep it beside the recording.
+
+    Focal length, centre, radial bend and an error of inverse depth: what makes surfaces coincide that were seen from
+    several places. Best from a minute in which the camera turns around in a furnished room.
+    """
+    from . import commands
+
+    commands.calibrate(sequence, frames, out, commands.pick_device(device))
+
+
 @bench.command(name="kernels")
 def bench_kernels(
     rays: Annotated[int, typer.Option(min=1, help="Rays; 43 samples each.")] = 1000,

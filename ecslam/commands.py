@@ -10,7 +10,7 @@ import webbrowser
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from . import config_files, datasets
 from .atomic import write_atomic
@@ -283,6 +283,42 @@ def write_synthetic(name: str, folder: Path, frames: str) -> None:
     readout_s = sequence.intrinsics.readout_s
     told = f"; the layout cannot tell its shutter, so open it as {folder}?readout={readout_s:g}" if readout_s else ""
     console.print(f"{folder}: {len(sequence)} frames in the Replica layout{told}", soft_wrap=True)
+
+
+def calibrate(address: str, frames: str, out: Path | None, device: str) -> None:
+    """Say what a recording tells of its camera, and write it to ``out``, by default where the recording finds it, if
+    that differs from what was given. Raises InputError."""
+    from .datasets.calibration import write_calibration
+    from .selfcalibration import self_calibrate
+    from .selfcalibration.report import table
+
+    place = out or datasets.calibration_place(address)
+    require_place(place, "--out")
+    opened = open_sequence(address)
+    config = config_files.for_layout(config_files.load_preset("live"), opened.layout)
+    with _progress() as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def watch(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what)
+            bar.update(tasks[what], completed=done, total=total)
+
+        found = self_calibrate(datasets.select_frames(opened, frames), config, device, watch)
+    console.print(table(found))
+    if not found.verdict.told.all():
+        console.print(
+            "What is not certain takes a recording in which the camera turns further around, in a furnished room.",
+            soft_wrap=True,
+        )
+    missed = [f"{1e3 * apart:.2f} mm" for apart in found.apart_m]
+    if not found.verdict.wrong.any():
+        console.print(f"Surfaces that several views see lie {missed[0]} apart. Nothing to write.", soft_wrap=True)
+        return
+    write_calibration(place, found.found)
+    console.print(f"Surfaces that several views see lie {missed[1]} apart instead of {missed[0]}.", soft_wrap=True)
+    used = "" if out is None else f"; open the recording as '{datasets.calibrated_address(address, place)}'"
+    console.print(f"{place}: written{used}", soft_wrap=True)
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:

@@ -53,6 +53,7 @@ LAYERS = (
         "evaluation",
     ),
     ("slam",),
+    ("selfcalibration",),
     ("runtime",),
     ("bench",),
     ("reports",),

@@ -1,12 +1,13 @@
 """Sequences of RGB-D images: one file a layout, opened by ``open_sequence`` without saying which it is."""
 
-from .addresses import lasting_address, split_address
+from .addresses import calibrated_address, lasting_address, split_address
 from .prefetch import Prefetch
 from .registry import calibration_place, open_sequence
 from .views import problems, select_frames
 
 __all__ = [
     "Prefetch",
+    "calibrated_address",
     "calibration_place",
     "lasting_address",
     "open_sequence",

@@ -41,4 +41,14 @@ def lasting_address(address: str) -> str:
         path = str(absolute(path))
     if options.get(CALIBRATION, NONE) != NONE:
         options[CALIBRATION] = str(absolute(options[CALIBRATION]))
+    return _joined(path, options)
+
+
+def calibrated_address(address: str, file: Path) -> str:
+    """The address of the same sequence with the calibration in ``file``, and its other options."""
+    path, options = split_address(address)
+    return _joined(path, options | {CALIBRATION: str(file)})
+
+
+def _joined(path: str, options: dict[str, str]) -> str:
     return f"{path}?{urlencode(options, safe='/', quote_via=quote)}" if options else path

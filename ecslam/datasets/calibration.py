@@ -82,6 +82,16 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror}); make room, or name another place") from None
 
 
+def calibration_of(sequence: Sequence) -> Calibration:
+    """The camera of a sequence's frames, with what has been put right in them already by a calibration."""
+    camera, inner = replace(sequence.intrinsics, distortion=()), sequence
+    while isinstance(inner, SequenceView):
+        if isinstance(inner, CalibratedView):
+            return replace(inner.calibration, camera=camera)
+        inner = inner.base
+    return Calibration(camera)
+
+
 def calibrated_by(sequence: Sequence, path: Path) -> SequenceView:
     """The sequence as the camera in a file saw it, with a note that says so. Raises InputError naming the file."""
     calibration = read_calibration(path)

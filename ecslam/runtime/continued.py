@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets.calibration import ERRORS, calibration_of
 from ..types import InputError, Sequence
 from .runfolder import CAMERA
 from .tally import Tally
@@ -14,10 +15,17 @@ from .tally import Tally
 SAME = 1e-6
 
 
+def camera_of(sequence: Sequence) -> dict[str, float]:
+    """What ``run.json`` tells of the camera."""
+    calibration = calibration_of(sequence)
+    errors = {name: getattr(calibration, name) for name in ERRORS}
+    return {name: getattr(sequence.intrinsics, name) for name in CAMERA} | errors
+
+
 def require_same_camera(address: str, sequence: Sequence, about: dict[str, Any]) -> None:
     """Raises InputError when the sequence at ``address`` is not the one that ``about``, of ``run.json``, tells of."""
-    for name in CAMERA:
-        was, here = about[name], getattr(sequence.intrinsics, name)
+    for name, here in camera_of(sequence).items():
+        was = about.get(name, 0)
         if not abs(was - here) < SAME:
             raise InputError(
                 f"{address}: not the sequence that this run was begun with ({name} was {was:g} and is "

@@ -22,13 +22,13 @@ from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
-from .continued import require_same_camera, require_same_times
+from .continued import camera_of, require_same_camera, require_same_times
 from .driven import Abandoned, SlamFactory, SlamLike
 from .driven import State as Arrays
 from .memory import return_holes
 from .meshjobs import MESH_POINTS, FrozenMap
 from .pictures import jpeg, shrink
-from .runfolder import CAMERA, RunFolder, read_about
+from .runfolder import RunFolder, read_about
 from .summary import summarise
 from .tally import Every, Stopwatch, Tally
 
@@ -114,7 +114,7 @@ class Run:
             "frames_total": len(s),
             "device": self.plan.device,
         }
-        about |= {name: getattr(s.intrinsics, name) for name in CAMERA}
+        about |= camera_of(s)
         self.folder.write("run.json", about)
 
     def _write_inputs(self) -> None:

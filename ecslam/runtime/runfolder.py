@@ -1,7 +1,7 @@
 """The folder that a run leaves behind: what a person, ``ecslam view`` or ``ecslam resume`` needs, in plain formats.
 
 run.json         sequence (address), name, layout, frames (the A:B:STEP asked for), frames_total, device, width, height,
-                 fx, fy, cx, cy
+                 fx, fy, cx, cy, and radial, inverse_depth, which a calibration has put right in the frames
 config.yaml      the resolved configuration; what was changed on the way, and when, is a notice in events.jsonl
 trajectory.txt   TUM format (timestamp tx ty tz qx qy qz qw), final poses, one line for each frame that was processed
 groundtruth.txt  the same for the frames that have ground truth; absent without any
