@@ -23,6 +23,10 @@ def table(found: Found) -> Table:
     for row, (name, digits) in enumerate(zip(ROWS, DIGITS, strict=True)):
         says = "the same" if found.verdict.told[row] else "nothing certain"
         if found.verdict.wrong[row]:
-            says = f"{new[row]:.{digits}f} ± {spread[row]:.{digits}f}"
-        out.add_row(name, f"{given[row]:.{digits}f}", says)
+            says = f"{_plain(new[row], digits)} ± {_plain(spread[row], digits)}"
+        out.add_row(name, _plain(given[row], digits), says)
     return out
+
+
+def _plain(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}"
