@@ -219,7 +219,6 @@ def calibrate(
     out: Annotated[
         Path | None, typer.Option(help="File to write; default: where the recording finds it by itself.")
     ] = None,
-    device: Device = "auto",
 ) -> None:
     """Find out from a recording what its depth camera is really like, and keep it beside the recording.
 
@@ -228,7 +227,7 @@ def calibrate(
     """
     from . import commands
 
-    commands.calibrate(sequence, frames, out, commands.pick_device(device))
+    commands.calibrate(sequence, frames, out)
 
 
 @bench.command(name="kernels")

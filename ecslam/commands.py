@@ -285,7 +285,7 @@ def write_synthetic(name: str, folder: Path, frames: str) -> None:
     console.print(f"{folder}: {len(sequence)} frames in the Replica layout{told}", soft_wrap=True)
 
 
-def calibrate(address: str, frames: str, out: Path | None, device: str) -> None:
+def calibrate(address: str, frames: str, out: Path | None) -> None:
     """Say what a recording tells of its camera, and write it to ``out``, by default where the recording finds it, if
     that differs from what was given. Raises InputError."""
     from .datasets.calibration import write_calibration
@@ -304,7 +304,7 @@ def calibrate(address: str, frames: str, out: Path | None, device: str) -> None:
                 tasks[what] = bar.add_task(what)
             bar.update(tasks[what], completed=done, total=total)
 
-        found = self_calibrate(datasets.select_frames(opened, frames), config, device, watch)
+        found = self_calibrate(datasets.select_frames(opened, frames), config, watch)
     console.print(table(found))
     if not found.verdict.told.all():
         console.print(

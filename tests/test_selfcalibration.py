@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 from ecslam.cli import app
 from ecslam.config_files import load_preset
 from ecslam.datasets import open_sequence, select_frames
-from ecslam.datasets.calibration import calibrated, calibration_of, read_calibration
+from ecslam.datasets.calibration import ERRORS, calibrated, calibration_of, read_calibration
+from ecslam.runtime.continued import camera_of, require_same_camera
 from ecslam.selfcalibration import self_calibrate
 from ecslam.selfcalibration.cells import PARAMETERS, cells_of, difference, moved, project, surface
 from ecslam.selfcalibration.joint import _residuals, adjust, verdict
@@ -206,7 +207,7 @@ def test_views_all_around_tell_the_camera(round_a_room: tuple[list[np.ndarray], 
 def test_a_camera_that_hardly_moves_does_not_tell_its_focal_length() -> None:
     room = open_sequence("synthetic/studio?frames=3000&size=320x240&noise=1")
     near = select_frames(room, "0:60")
-    found = self_calibrate(near, load_preset("live"), "cpu", lambda *_: None)
+    found = self_calibrate(near, load_preset("live"), lambda *_: None)
     assert not found.verdict.wrong.any()
     assert found.found == found.given
     assert not found.verdict.told[0]
@@ -215,7 +216,7 @@ def test_a_camera_that_hardly_moves_does_not_tell_its_focal_length() -> None:
 def test_too_few_views_are_said_so() -> None:
     room = select_frames(open_sequence("synthetic/studio?frames=300&size=160x120"), "0:20")
     with pytest.raises(InputError, match="only 4 of its views"):
-        self_calibrate(room, load_preset("live"), "cpu", lambda *_: None)
+        self_calibrate(room, load_preset("live"), lambda *_: None)
 
 
 @pytest.mark.slow
@@ -243,3 +244,13 @@ def test_what_is_found_adds_to_what_a_calibration_has_put_right() -> None:
     given = Calibration(replace(room.intrinsics, fx=130.0), 0.01, 0.002)
     assert calibration_of(room) == Calibration(room.intrinsics)
     assert calibration_of(select_frames(calibrated(room, given), "0:5")) == given
+
+
+def test_a_run_goes_on_only_with_the_bend_that_it_was_begun_with() -> None:
+    room = open_sequence("synthetic/studio?frames=10&size=160x120")
+    bent = calibrated(room, Calibration(room.intrinsics, 0.01))
+    require_same_camera("bent", bent, camera_of(bent))
+    without = {name: value for name, value in camera_of(room).items() if name not in ERRORS}
+    require_same_camera("begun by an older version", room, without)
+    with pytest.raises(InputError, match=r"radial was 0\.01 and is 0"):
+        require_same_camera("straight", room, camera_of(bent))

@@ -103,7 +103,7 @@ def find_intrinsics(
             f"write its 3x3 matrix to {INTRINSICS_FILE} there"
         )
     note = f"no {INTRINSICS_FILE}: the usual intrinsics for {made_for} were scaled to {here}"
-    return default.resized(*size), (note,)
+    return default.resized(*size), (f"{note}; ecslam calibrate can tell better",)
 
 
 def common_size(files: list[Path], samples: int = 9) -> tuple[int, int]:

@@ -223,7 +223,7 @@ def _camera(path: Path, known: Benchmark | None, size: tuple[int, int]) -> tuple
         notes = (
             *notes,
             f"a standard Kinect is assumed: no {INTRINSICS_FILE} or {CALIBRATION}, and no recording that is known by "
-            "its folder's name (freiburg1, 2 or 3 ...)",
+            "its folder's name (freiburg1, 2 or 3 ...); ecslam calibrate can tell better",
         )
     if calibrated and (known or by_hand):
         notes = (*notes, f"{CALIBRATION} is not used: {INTRINSICS_FILE if by_hand else 'the camera is known'}")

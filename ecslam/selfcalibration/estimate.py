@@ -9,7 +9,6 @@ from functools import partial
 from itertools import count
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ..config import Config
@@ -45,14 +44,15 @@ class Found:
     views: int
 
 
-def self_calibrate(sequence: Sequence, config: Config, device: str, watch: Watch) -> Found:
+def self_calibrate(sequence: Sequence, config: Config, watch: Watch) -> Found:
     """Focal length, centre of the image, radial bend and offset of inverse depth of a recording's camera.
 
-    config: how to track it. watch: called with what is being done, and how many steps of how many are. A parameter
-    without which the views would fit about as well stays as given. Raises InputError where there is too little to tell.
+    config: how to track it, on the CPU. watch: called with what is being done, and how many steps of how many are. A
+    parameter without which the views would fit about as well stays as given. A bend adds to one that a calibration has
+    put right already, to first order. Raises InputError where there is too little to tell.
     """
     given = Calibration(sequence.intrinsics)
-    views, poses = _views(sequence, config, device, watch)
+    views, poses = _views(sequence, config, watch)
     if len(views) < LEAST_VIEWS:
         raise InputError(
             f"{sequence.name}: only {len(views)} of its views show enough flat surface to calibrate by; record some "
@@ -79,11 +79,11 @@ def self_calibrate(sequence: Sequence, config: Config, device: str, watch: Watch
     return Found(before, moved(before, change), says, spread, (as_given.apart_m, joint.apart_m), len(views))
 
 
-def _views(sequence: Sequence, config: Config, device: str, watch: Watch) -> tuple[list[Cells], NDArray[np.float64]]:
+def _views(sequence: Sequence, config: Config, watch: Watch) -> tuple[list[Cells], NDArray[np.float64]]:
     """Some views, as cells, and where they were seen from [V, 4, 4]."""
     without_map = replace(config.mapping, first_iterations=1, iterations=0)
     config = replace(config, schedule="strict", mapping=without_map)
-    slam = Slam(config, sequence.intrinsics, device=torch.device(device))
+    slam = Slam(config, sequence.intrinsics)
     usable = np.flatnonzero(in_order(sequence.timestamps()))
     wanted = set(usable[evenly(len(usable), min(VIEWS, max(len(usable) // EVERY, 1)))].tolist())
     found: list[tuple[int, Cells]] = []

@@ -25,7 +25,7 @@ ITERATIONS, AT_REST = 20, 5e-4
 NOISE_M, NOISE_PER_M = 0.003, 0.003  # standard deviation of a point along its ray: near, and more by distance squared
 NEAR_M, FACING, OFF_M, LEAST_SHARED = 0.1, 0.7, 0.3, 20
 USUAL = np.array([0.05, 10.0, 10.0, 0.1, 0.05])  # standard deviations of the parameters before anything is known
-LEAST_DAMPING = 1e-6
+LEAST_DAMPING, TINY = 1e-6, 1e-9
 GROUPS = [0], [1, 2], [3], [4]
 RESOLVED, WORTH = np.array([0.01, 5.0, 5.0, 0.02, 0.004]), 0.02
 
@@ -86,7 +86,7 @@ def adjust(
         if iteration >= len(KERNELS_M) and np.abs(step).max() < AT_REST:
             break
     spread = np.zeros((PARAMETERS, PARAMETERS))
-    spread[np.ix_(free, free)] = sums.squares * np.linalg.inv(system)[count - 6 :, count - 6 :]
+    spread[np.ix_(free, free)] = max(sums.squares, TINY) * np.linalg.inv(system)[count - 6 :, count - 6 :]
     return Joint(poses, seen, sums.size_m / max(sums.used, 1), spread)
 
 
