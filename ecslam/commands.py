@@ -287,14 +287,14 @@ def write_synthetic(name: str, folder: Path, frames: str) -> None:
 
 def calibrate(address: str, frames: str, out: Path | None) -> None:
     """Say what a recording tells of its camera, and write it to ``out``, by default where the recording finds it, if
-    that differs from what was given. Raises InputError."""
+    that differs from what the recording itself says, or the calibration that ``address`` names. Raises InputError."""
     from .datasets.calibration import write_calibration
     from .selfcalibration import self_calibrate
-    from .selfcalibration.report import table
+    from .selfcalibration.report import sentences, table
 
     place = out or datasets.calibration_place(address)
     require_place(place, "--out")
-    opened = open_sequence(address)
+    opened = open_sequence(datasets.named_calibration_only(address))
     config = config_files.for_layout(config_files.load_preset("live"), opened.layout)
     with _progress() as bar:
         tasks: dict[str, TaskID] = {}
@@ -306,19 +306,14 @@ def calibrate(address: str, frames: str, out: Path | None) -> None:
 
         found = self_calibrate(datasets.select_frames(opened, frames), config, watch)
     console.print(table(found))
-    if not found.verdict.told.all():
-        console.print(
-            "What is not certain takes a recording in which the camera turns further around, in a furnished room.",
-            soft_wrap=True,
-        )
-    missed = [f"{1e3 * apart:.2f} mm" for apart in found.apart_m]
-    if not found.verdict.wrong.any():
-        console.print(f"Surfaces that several views see lie {missed[0]} apart. Nothing to write.", soft_wrap=True)
-        return
-    write_calibration(place, found.found)
-    console.print(f"Surfaces that several views see lie {missed[1]} apart instead of {missed[0]}.", soft_wrap=True)
-    used = "" if out is None else f"; open the recording as '{datasets.calibrated_address(address, place)}'"
-    console.print(f"{place}: written{used}", soft_wrap=True)
+    for line in sentences(found):
+        console.print(line, soft_wrap=True)
+    if found.verdict.wrong.any():
+        write_calibration(place, found.found)
+        used = "" if out is None else f"; open the recording as '{datasets.calibrated_address(address, place)}'"
+        console.print(f"{place}: written{used}", soft_wrap=True)
+    elif out is None and place.exists():
+        console.print(f"{place}: says otherwise; remove it if this recording is better", soft_wrap=True)
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from ecslam.cli import app
 from ecslam.config_files import load_preset
-from ecslam.datasets import open_sequence, select_frames
+from ecslam.datasets import named_calibration_only, open_sequence, select_frames
 from ecslam.datasets.calibration import ERRORS, calibrated, calibration_of, read_calibration
 from ecslam.runtime.continued import camera_of, require_same_camera
 from ecslam.selfcalibration import self_calibrate
@@ -231,6 +231,13 @@ def test_the_command_finds_a_wrong_focal_length_and_is_then_content(tmp_path: Pa
     again = CliRunner().invoke(app, ["calibrate", f"{address}&calibration={file}", "--out", str(tmp_path / "no.yaml")])
     assert "Nothing to write" in again.output.replace("\n", " ")
     assert not (tmp_path / "no.yaml").exists()
+
+
+def test_a_recording_is_held_against_what_it_says_itself_unless_a_file_is_named() -> None:
+    assert named_calibration_only("synthetic/studio?frames=3") == "synthetic/studio?calibration=none&frames=3"
+    assert named_calibration_only("a/b") == "a/b?calibration=none"
+    assert named_calibration_only("a/b?calibration=c.yaml") == "a/b?calibration=c.yaml"
+    assert open_sequence("synthetic/studio?frames=3&calibration=none").intrinsics.fx == 512
 
 
 def test_a_room_needs_a_place_for_what_is_found() -> None:

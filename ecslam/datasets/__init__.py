@@ -1,6 +1,6 @@
 """Sequences of RGB-D images: one file a layout, opened by ``open_sequence`` without saying which it is."""
 
-from .addresses import calibrated_address, lasting_address, split_address
+from .addresses import calibrated_address, lasting_address, named_calibration_only, split_address
 from .prefetch import Prefetch
 from .registry import calibration_place, open_sequence
 from .views import problems, select_frames
@@ -10,6 +10,7 @@ __all__ = [
     "calibrated_address",
     "calibration_place",
     "lasting_address",
+    "named_calibration_only",
     "open_sequence",
     "problems",
     "select_frames",

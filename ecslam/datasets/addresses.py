@@ -50,5 +50,11 @@ def calibrated_address(address: str, file: Path) -> str:
     return _joined(path, options | {CALIBRATION: str(file)})
 
 
+def named_calibration_only(address: str) -> str:
+    """The address of the same sequence without the calibration that it has by itself."""
+    path, options = split_address(address)
+    return _joined(path, {CALIBRATION: NONE} | options)
+
+
 def _joined(path: str, options: dict[str, str]) -> str:
     return f"{path}?{urlencode(options, safe='/', quote_via=quote)}" if options else path

@@ -1,4 +1,4 @@
-"""What was found of a camera, as a table for people."""
+"""What was found of a camera, for people."""
 
 from __future__ import annotations
 
@@ -25,6 +25,18 @@ def table(found: Found) -> Table:
         if found.verdict.wrong[row]:
             says = f"{_plain(new[row], digits)} ± {_plain(spread[row], digits)}"
         out.add_row(name, _plain(given[row], digits), says)
+    return out
+
+
+def sentences(found: Found) -> list[str]:
+    """What it comes to, and what to do about what is not told."""
+    before, after = (f"{1e3 * apart:.2f} mm" for apart in found.apart_m)
+    if found.verdict.wrong.any():
+        out = [f"Surfaces that several views see lie {after} apart instead of {before}."]
+    else:
+        out = [f"Surfaces that several views see lie {before} apart. Nothing to write."]
+    if not found.verdict.told.all():
+        out.append("What is not certain takes a recording in which the camera turns further, in a furnished room.")
     return out
 
 
