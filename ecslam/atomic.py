@@ -6,6 +6,8 @@ import os
 import threading
 from pathlib import Path
 
+from .types import InputError
+
 TEMPORARY = ".tmp"
 
 
@@ -25,6 +27,14 @@ def write_atomic(path: Path, data: bytes) -> None:
         temporary.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def write_named(path: Path, data: bytes) -> None:
+    """``write_atomic`` for a file that somebody has named. Raises InputError when it cannot be written."""
+    try:
+        write_atomic(path, data)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); make room, or name another place") from None
 
 
 def sync_folder(folder: Path) -> None:

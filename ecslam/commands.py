@@ -13,9 +13,8 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from . import config_files, datasets
-from .atomic import write_atomic
+from .atomic import write_named
 from .config import Config
-from .datasets.addresses import lasting_address
 from .datasets.roots import sequences_under
 from .messages import Notice, Quit, Snapshot
 from .reports import Reports, console, finish_run
@@ -97,7 +96,7 @@ def make_engine(
     config: Config, address: str, opened: Sequence, out: Path, device: str, frames: str, offers: tuple[str, ...]
 ) -> Engine:
     """An engine for ``opened``, which came from ``address``, writing to ``out``. offers: what a restart may choose."""
-    address = lasting_address(address)
+    address = datasets.lasting_address(address)
 
     def open_again(other: str) -> Sequence:
         return opened if other == address else datasets.open_sequence(other)
@@ -116,7 +115,7 @@ def resume_engine(folder: Path, device: str, sequence: str | None) -> Engine:
         and not Path(datasets.split_address(address)[0]).exists()
     ):
         raise InputError(f"{folder}: its sequence is no longer at {address}; say where it is with --sequence")
-    moved = None if sequence is None else lasting_address(sequence)
+    moved = None if sequence is None else datasets.lasting_address(sequence)
     return Engine.resume(folder, device=device, sequences=BUILT_IN, sequence=moved)
 
 
@@ -266,7 +265,7 @@ def remesh(folder: Path, voxel_m: float, out: Path) -> None:
     sdf, color = slam.query()
     with console.status("meshing"):
         made = build_mesh(FrozenMap(len(slam.trajectory) - 1, sdf, color, slam.surface_points(MESH_POINTS)), voxel_m)
-    _save(out, mesh_bytes(made.mesh, out.suffix[1:]))
+    write_named(out, mesh_bytes(made.mesh, out.suffix[1:]))
     console.print(f"{out}: {len(made.mesh.vertices)} vertices, {len(made.mesh.faces)} triangles", soft_wrap=True)
 
 
@@ -319,14 +318,7 @@ def calibrate(address: str, frames: str, out: Path | None) -> None:
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
     """Write figures to a file, when one is wanted. Raises InputError."""
     if path is not None:
-        _save(path, to_json(result).encode())
-
-
-def _save(path: Path, data: bytes) -> None:
-    try:
-        write_atomic(path, data)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); make room, or name another place") from None
+        write_named(path, to_json(result).encode())
 
 
 def _progress() -> Progress:

@@ -38,8 +38,12 @@ def straight(points: NDArray[np.float32], camera: Intrinsics, sweep: Sweep) -> N
     if not sweep.any():
         return points
     share = (camera.fy * points[:, 1:2] / points[:, 2:] + camera.cy + 0.5) / camera.height - 0.5
-    move = sweep[:3] + np.cross(sweep[3:], points)
-    return (points + share * move).astype(np.float32)
+    return halfway(points, share, sweep).astype(np.float32)
+
+
+def halfway(points: NDArray[np.floating], share: NDArray[np.floating], sweep: Sweep) -> NDArray[np.float64]:
+    """Camera points [N, 3], seen at a ``share`` [N, 1] of the sweep from -0.5 to 0.5, as seen at 0."""
+    return np.asarray(points + share * (sweep[:3] + np.cross(sweep[3:], points)))
 
 
 def straight_pixels(pixels: Pixels, camera: Intrinsics, sweep: Sweep) -> Pixels:

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import sens_writer
 
-from ecslam.commands import lasting_address
-from ecslam.datasets import calibration_place, open_sequence, problems
+from ecslam.datasets import calibration_place, lasting_address, open_sequence, problems
 from ecslam.datasets.calibration import calibrated, read_calibration, write_calibration
 from ecslam.datasets.check import check_sequence, format_report
 from ecslam.types import Calibration, Frame, FrameError, InputError, Intrinsics, Mesh, Sequence

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_atomic
+from ..atomic import write_named
 from ..strict_yaml import is_number, kind_of, nearest, parse_yaml
 from ..types import Calibration, Frame, InputError, Intrinsics, Sequence
 from .lens import LookUp
@@ -76,10 +76,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     given = {key: float(getattr(k, key)) for key in PINHOLE} | {key: int(getattr(k, key)) for key in SIZE}
     given |= {key: float(getattr(calibration, key)) for key in ERRORS}
     text = ABOUT + "".join(f"{key}: {value!r}\n" for key, value in given.items())
-    try:
-        write_atomic(path, text.encode())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); make room, or name another place") from None
+    write_named(path, text.encode())
 
 
 def calibration_of(sequence: Sequence) -> Calibration:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..shutter import Sweep
+from ..shutter import Sweep, halfway
 from ..types import Calibration, Intrinsics
 
 ACROSS, REACH = 80, 2  # cells in a row of the image; a plane is fitted to a cell and so many around it
@@ -117,8 +117,7 @@ def surface(cells: Cells, seen: Calibration) -> Surface:
     change[:, :, 4] = -points
     change *= depth[:, None, None]
     share = cells.rows[:, None]
-    moved = points + share * (cells.sweep[:3] + np.cross(cells.sweep[3:], points))
-    return Surface(moved, normals + share * np.cross(cells.sweep[3:], normals), change)
+    return Surface(halfway(points, share, cells.sweep), normals + share * np.cross(cells.sweep[3:], normals), change)
 
 
 def project(points: NDArray[np.float64], seen: Calibration) -> NDArray[np.float64]:
@@ -140,10 +139,13 @@ def moved(seen: Calibration, step: NDArray[np.float64]) -> Calibration:
     return Calibration(camera, seen.radial + float(step[3]), seen.inverse_depth + float(step[4]))
 
 
+def parameters(seen: Calibration) -> NDArray[np.float64]:
+    """Focal length and centre in pixels, radial, inverse depth in 1/m [5]."""
+    return np.array([seen.camera.fx, seen.camera.cx, seen.camera.cy, seen.radial, seen.inverse_depth])
+
+
 def difference(seen: Calibration, start: Calibration) -> NDArray[np.float64]:
     """The step [5] that leads from ``start`` to ``seen``."""
-    a, b = seen.camera, start.camera
-    return np.array(
-        [np.log(a.fx / b.fx), a.cx - b.cx, a.cy - b.cy, seen.radial - start.radial,
-         seen.inverse_depth - start.inverse_depth]
-    )  # fmt: skip
+    step = parameters(seen) - parameters(start)
+    step[0] = np.log(seen.camera.fx / start.camera.fx)
+    return step

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from ..descent import moved as moved_pose
 from ..indices import evenly
+from ..rigid import inverse
 from ..types import Calibration
+from ..window import parallax
 from .cells import PARAMETERS, Cells, Surface, difference, moved, project, surface
 
 NEIGHBOURS, OTHERS = 3, 8  # views that each is compared with: before it, and of the rest
@@ -130,8 +132,7 @@ def _pairs(poses: NDArray[np.float64]) -> list[tuple[int, int]]:
     """Views that probably see the same, each pair both ways round."""
     found = set()
     for i, pose in enumerate(poses):
-        angle = np.degrees(np.arccos(np.clip(poses[:, :3, 2] @ pose[:3, 2], -1, 1)))
-        distance = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
+        distance, angle = parallax(poses, pose)
         others = np.flatnonzero((angle < SHARED_DEG) & (distance < SHARED_M))
         others = others[np.abs(others - i) > NEIGHBOURS]
         for j in (*range(max(i - NEIGHBOURS, 0), i), *others[evenly(len(others), OTHERS)]):
@@ -173,8 +174,9 @@ def _residuals(
     """How far points of one view lie before the planes ``on`` another ``view``: by the motions of both, translation and
     rotation about each camera in the world, and by the camera's parameters [n, 17]; itself [n], metres; weight [n].
     None where hardly any point meets a plane."""
-    turn = on_c2w[:3, :3].T @ of_c2w[:3, :3]
-    there = of.points @ turn.T + on_c2w[:3, :3].T @ (of_c2w[:3, 3] - on_c2w[:3, 3])
+    motion = inverse(on_c2w) @ of_c2w
+    turn = motion[:3, :3]
+    there = of.points @ turn.T + motion[:3, 3]
     point = np.flatnonzero(there[:, 2] > NEAR_M)
     cell = view.at(project(there[point], seen))
     point, cell = point[cell >= 0], cell[cell >= 0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rich.table import Table
 
+from .cells import parameters
 from .estimate import Found
 
 ROWS = ("focal length (px)", "centre, across (px)", "centre, down (px)", "radial", "inverse depth (1/m)")
@@ -15,10 +16,7 @@ def table(found: Found) -> Table:
     out = Table(title=f"from {found.views} views")
     for name in ("", "given", "the recording says"):
         out.add_column(name, justify="left" if not name else "right")
-    given, new = (
-        (each.camera.fx, each.camera.cx, each.camera.cy, each.radial, each.inverse_depth)
-        for each in (found.given, found.found)
-    )
+    given, new = parameters(found.given), parameters(found.found)
     spread = found.spread * (new[0], 1, 1, 1, 1)
     for row, (name, digits) in enumerate(zip(ROWS, DIGITS, strict=True)):
         says = "the same" if found.verdict.told[row] else "nothing certain"

@@ -9,7 +9,6 @@ from ...types import InputError
 from ..addresses import SYNTHETIC, parse_options
 
 ROOMS = ("studio", "apartment", "corridor")
-PREFIX = SYNTHETIC
 MAX_SIDE, MAX_FRAMES = 4096, 100_000
 MOST_READOUT_S, MOST_EXPOSURE = 1 / 30, 0.9
 SWITCH = {"0": False, "1": True}
@@ -40,11 +39,13 @@ def parse_address(address: str, defaults: Address | None = None) -> Address:
 
     The options are in ``FORMS``. Raises InputError for an unknown room, an unknown option or a value out of range.
     """
-    name, _, query = address.removeprefix(PREFIX).partition("?")
+    name, _, query = address.removeprefix(SYNTHETIC).partition("?")
     if name not in ROOMS:
         near = difflib.get_close_matches(name, ROOMS, 1, 0.4)
-        hint = f"did you mean {PREFIX}{near[0]}?" if near else f"choose from {', '.join(PREFIX + r for r in ROOMS)}"
-        raise InputError(f"{PREFIX}{name}: no such built-in room; {hint}")
+        hint = (
+            f"did you mean {SYNTHETIC}{near[0]}?" if near else f"choose from {', '.join(SYNTHETIC + r for r in ROOMS)}"
+        )
+        raise InputError(f"{SYNTHETIC}{name}: no such built-in room; {hint}")
     out = replace(defaults or Address(name), room=name)
     for key, value in parse_options(query):
         out = _apply(out, key, value, address)
@@ -53,7 +54,7 @@ def parse_address(address: str, defaults: Address | None = None) -> Address:
 
 def check(address: Address) -> Address:
     """The address itself. Raises InputError where image size, number of frames or seed cannot be used."""
-    where = PREFIX + address.room
+    where = SYNTHETIC + address.room
     if not (16 <= address.width <= MAX_SIDE and 16 <= address.height <= MAX_SIDE):
         raise InputError(
             f"{where}: size {address.width}x{address.height} is out of range; use 16 to {MAX_SIDE} pixels a side"

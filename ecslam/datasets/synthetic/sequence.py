@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...types import Frame, Intrinsics, Mesh
-from .address import PREFIX, Address, check, parse_address
+from ..addresses import SYNTHETIC
+from .address import Address, check, parse_address
 from .lighting import bake
 from .mesh import reference_mesh
 from .noise import kinect
@@ -83,7 +84,7 @@ class SyntheticSequence:
 
     def __post_init__(self) -> None:
         a = self.address
-        self.name: str = PREFIX + a.room
+        self.name: str = SYNTHETIC + a.room
         self.layout: str = "synthetic"
         self.preset: str = "lite"
         focal, centre = FOCAL * a.width, ((a.width - 1) / 2, (a.height - 1) / 2)
