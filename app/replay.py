@@ -185,6 +185,7 @@ class ReplayEngine:
             memory_mb=float(run.summary.get("peak_memory_mb") or 0),
             loops=tuple(e for e in run.loops if e.frame <= frame),
             skipped=int(run.summary.get("skipped_frames") or 0),
+            dropped=int(run.summary.get("dropped_frames") or 0),
             lost_frames=int(run.summary.get("lost_frames") or 0),
             reason=". ".join(filter(None, (run.incomplete, self._problem))),
         )

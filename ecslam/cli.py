@@ -38,7 +38,8 @@ SequenceArgument = Annotated[
     str,
     typer.Argument(
         help="A folder (7-Scenes, TUM RGB-D, Replica, ScanNet ..., recognised by itself), a file (.bag, .mcap, .db3, "
-        ".sens, .r3d) or a built-in room: synthetic/studio, synthetic/apartment, synthetic/corridor."
+        ".sens, .r3d), a built-in room (synthetic/studio, synthetic/apartment, synthetic/corridor) or, to run on, "
+        "a camera that is plugged in: camera/realsense."
     ),
 ]
 Preset = Annotated[str | None, typer.Option(help="lite, full, live, scannet or tum; default: what suits the layout.")]
@@ -53,6 +54,15 @@ Frames = Annotated[str, typer.Option(metavar="A:B:STEP", help="Which frames, as 
 Seed = Annotated[int | None, typer.Option(min=0, help="Random seed; default: the configuration's (0).")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ... or auto: a CUDA GPU where there is one.")]
 Schedule = Annotated[str | None, typer.Option(help="strict (deterministic on a CPU) or overlap (two threads).")]
+Realtime = Annotated[
+    bool, typer.Option("--realtime", help="As from a camera: no faster than recorded, frames are left out to keep up.")
+]
+Record = Annotated[
+    Path | None, typer.Option(help="Where a camera's images go, a new folder; default: recordings/CAMERA-TIME.")
+]
+CameraArgument = Annotated[
+    str, typer.Argument(help="A camera that is plugged in, as in 'camera/realsense?size=640x480&fps=30'.")
+]
 Headless = Annotated[bool, typer.Option("--headless", help="No dashboard: run, write the run folder, end.")]
 Out = Annotated[
     Path | None, typer.Option(help="Run folder; a run in it is replaced. Default: a new one, runs/SEQUENCE-PRESET.")
@@ -78,25 +88,40 @@ def run(
     seed: Seed = None,
     device: Device = "auto",
     schedule: Schedule = None,
+    realtime: Realtime = False,
     headless: Headless = False,
     out: Out = None,
+    record: Record = None,
     data: Data = None,
     host: Host = "127.0.0.1",
     port: Port = 8080,
     no_browser: NoBrowser = False,
 ) -> None:
-    """Run SLAM on a recording or a built-in room; watch it in the browser unless --headless."""
+    """Run SLAM on a recording, a built-in room or a camera; watch it in the browser unless --headless."""
     from . import commands
 
-    opened = commands.open_sequence(sequence)
-    resolved = resolve_config(preset, opened, config, settings, seed, schedule)
-    folder = out or commands.unused(Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}")
     offered = commands.offered(data or [])
-    listener = None if headless else commands.listen(host, port)
-    engine = commands.make_engine(
-        resolved, sequence, opened, folder, commands.pick_device(device, resolved), frames, offered
-    )
-    commands.start(engine, listener, host, not no_browser)
+    with commands.source(sequence, frames, record) as (address, opened):
+        wanted = [*(settings or []), *(["realtime=true"] if realtime else [])]
+        resolved = resolve_config(preset, opened, config, wanted, seed, schedule)
+        folder = out or commands.unused(Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}")
+        listener = None if headless else commands.listen(host, port)
+        engine = commands.make_engine(
+            resolved, address, opened, folder, commands.pick_device(device, resolved), frames, offered
+        )
+        commands.start(engine, listener, host, not no_browser)
+
+
+@app.command()
+def record(
+    camera: CameraArgument = "camera/realsense",
+    folder: Annotated[Path | None, typer.Argument(help="A new folder; default: recordings/CAMERA-TIME.")] = None,
+    seconds: Annotated[float, typer.Option(min=0, help="How long; 0 = until Ctrl-C.")] = 0.0,
+) -> None:
+    """Record what a camera sees, for `ecslam run` later. `ecslam run camera/...` does so while it maps."""
+    from . import commands
+
+    commands.record(camera, folder, seconds)
 
 
 @app.command()

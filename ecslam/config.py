@@ -163,12 +163,15 @@ class Config:
 
     denoise: smooth depth by as much as it is noisy (ours). deskew: take out the motion during a rolling shutter (ours,
     see ``shutter``). exposure: bring luminance to what the first frame's exposure would give (ours, see ``exposure``).
-    movers: whether what moves by itself is left in (ours, see ``movers``).
+    movers: whether what moves by itself is left in (ours, see ``movers``). realtime: play a recording no faster than it
+    was taken and leave out the frames that come while the engine is busy, as with a camera (ours, see
+    ``datasets.pace``).
     """
 
     preset: str = "lite"
     seed: int = _number(0, 0, 2**31 - 1)
     schedule: Literal["strict", "overlap"] = "strict"
+    realtime: bool = False
     fus: bool = True
     eba: bool = True
     deskew: bool = True

@@ -126,7 +126,8 @@ class Snapshot:
     fov_y_rad, aspect: of the camera, for frustums. reason: why the state is LOST or FAILED, how far the last mapping
     is, or what cannot be shown, else "". map_loss: the objective of the last mapping so far; losses: see
     ``StepReport``. reported: the frame that losses, window and times are of, None before there is one; an earlier one
-    than ``frame`` while that is at work.
+    than ``frame`` while that is at work. dropped: frames that came while the engine was busy, in real time.
+    live: whether a camera is on, so that ``frames_total`` grows.
     """
 
     state: State
@@ -154,6 +155,8 @@ class Snapshot:
     reason: str = ""
     map_loss: float | None = None
     reported: int | None = None
+    dropped: int = 0
+    live: bool = False
 
 
 @dataclass(frozen=True)
@@ -229,6 +232,7 @@ class Restart:
     preset: str | None = None
     seed: int | None = None
     schedule: str | None = None
+    realtime: bool | None = None
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ from .types import InputError
 console = Console(markup=False)
 FIGURES = (
     "sequence", "preset", "kernels", "frames", "fps_wall", "ate_rmse_cm", "loop_closures", "skipped_frames",
-    "lost_frames",
+    "dropped_frames", "lost_frames",
 )  # fmt: skip
+DONE = ("frames", "skipped_frames", "dropped_frames")
 FINAL = ("trajectory.txt", "checkpoints", "mesh.ply", "summary.json")
 
 
@@ -77,7 +78,7 @@ def finish_run(folder: Path, summary: dict[str, Any]) -> None:
     for note in (summary["kernels_note"], *(f"{name} not saved ({why})" for name, why in summary["not_saved"].items())):
         if note:
             console.print(f"  note: {note}", soft_wrap=True)
-    saved, done = newest_frame(folder / "checkpoints"), summary["frames"] + summary["skipped_frames"]
+    saved, done = newest_frame(folder / "checkpoints"), sum(summary[name] for name in DONE)
     if 0 < saved < done:
         console.print(f"  note: the newest checkpoint holds {saved} of the {done} frames done", soft_wrap=True)
     if not (folder / "mesh.ply").is_file():

@@ -21,12 +21,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ecslam.datasets import open_sequence, problems, registry, select_frames
+from ecslam.datasets import open_sequence, problems, recording, registry, select_frames
 from ecslam.datasets.check import check_sequence, format_report
 from ecslam.datasets.reading import rigid
 from ecslam.datasets.synthetic import Address
 from ecslam.datasets.tum import associate, interpolate_poses
-from ecslam.types import FrameError, InputError, Sequence
+from ecslam.types import FrameError, InputError, Intrinsics, Sequence
 
 W, H, N = 64, 48, 6
 METRES = 2.0
@@ -184,6 +184,21 @@ def write_rosbag(root: Path) -> Path:
     return root
 
 
+def write_recording(root: Path) -> Path:
+    (root / "rgb").mkdir(parents=True)
+    camera, lines, truth = Intrinsics(60.0, 60.0, 31.5, 23.5, W, H), [], []
+    for i in range(N):
+        write(root / f"rgb/{i:06d}.jpg", picture(i))
+        write(root / f"depth/{i:06d}.png", depth_values(1000))
+        lines.append(f"{1e9 + i / 30:.6f} {i:06d}\n")
+        x, y, z, w = Rotation.from_matrix(pose(i)[:3, :3]).as_quat()
+        truth.append(f"{1e9 + i / 30:.6f} {pose(i)[0, 3]} 0 0 {x} {y} {z} {w}\n")
+    (root / "frames.txt").write_text("".join(lines))
+    (root / "groundtruth.txt").write_text("".join(truth))
+    recording.write_rig(root / "recording.yaml", recording.Rig("a camera", 1000.0, camera, camera, np.eye(4)))
+    return root
+
+
 WRITERS: dict[str, Callable[[Path], Path]] = {
     "7scenes": write_7scenes,
     "tum": write_tum,
@@ -195,8 +210,9 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "rosbag": write_rosbag,
     "sens": write_sens,
     "record3d": write_record3d,
+    "recording": write_recording,
 }
-PRESETS = {"tum": "tum", "scannet": "scannet", "sens": "scannet"}
+PRESETS = {"recording": "live", "tum": "tum", "scannet": "scannet", "sens": "scannet"}
 
 
 # ---- the contract ----

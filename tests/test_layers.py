@@ -53,7 +53,7 @@ LAYERS = (
         "evaluation",
     ),
     ("slam",),
-    ("selfcalibration",),
+    ("selfcalibration", "cameras"),
     ("runtime",),
     ("bench",),
     ("reports",),

@@ -395,12 +395,13 @@ def test_quitting_while_the_last_mesh_is_made_keeps_everything_else(tmp_path, mo
     begun = threading.Event()
 
     def endless(frozen, voxel_m, max_triangles=0, should_stop=None):
-        begun.set()
         while not should_stop():
+            if made[0].finished:
+                begun.set()
             time.sleep(0.005)
         raise MeshingStopped
 
-    with running(tmp_path, FakeSequence(3), paused_at=2) as (engine, watch, _):
+    with running(tmp_path, FakeSequence(3), paused_at=2) as (engine, watch, made):
         monkeypatch.setattr("ecslam.runtime.workshop.build_mesh", endless)
         watch.ask(Resume())
         assert begun.wait(10)

@@ -98,7 +98,7 @@ class Panel(BasePanel):
         verb, s = event.target.value, self.hub.current
         if verb in _VERBS:
             self.hub.submit(_VERBS[verb], event.client)
-        elif self._ending or (s is not None and s.frame + 1 >= s.frames_total):
+        elif self._ending or (s is not None and not s.live and s.frame + 1 >= s.frames_total):
             self.hub.submit(Stop(), event.client)
         else:
             self.hub.post(lambda: self._ask(True))
@@ -135,6 +135,9 @@ class Panel(BasePanel):
                 initial_value=given.schedule,
                 hint="strict: repeatable; overlap: mapping in parallel",
             )
+            self._realtime = gui.add_checkbox(
+                "Real time", given.realtime, hint="As from a camera: frames are left out to keep up with the recording"
+            )
             self.hub.commands(
                 gui.add_button("Restart", color="orange", hint=RESTART),
                 self._restart,
@@ -145,7 +148,8 @@ class Panel(BasePanel):
             self.hub.commands(self._go_on, lambda: LoadPreset(self._preset.value))
 
     def _restart(self) -> Restart:
-        return Restart(self._sequence.value, self._preset.value, int(self._seed.value), self._schedule.value)
+        seed, schedule = int(self._seed.value), self._schedule.value
+        return Restart(self._sequence.value, self._preset.value, seed, schedule, self._realtime.value)
 
     def _live_parameters(self) -> None:
         gui = self.hub.server.gui

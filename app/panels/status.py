@@ -75,7 +75,10 @@ def render(s: Snapshot | None, coming: str) -> str:
         waiting = theme.chip("Waiting for the first frame", theme.KEYFRAME)
         return f'<div class="ec"><div class="ec-head">{waiting}</div></div>'
     color = theme.STATE_COLORS[s.state.value]
-    done = 100 * (s.frame + 1) / max(s.frames_total, 1)
+    done, behind = 100 * (s.frame + 1) / max(s.frames_total, 1), s.frames_total - s.frame - 1
+    progress = f"{s.frame + 1} of {s.frames_total}, {done:.0f} %"
+    if s.live:
+        progress = f"camera on, {behind} behind"
     cells = [
         theme.cell(theme.number(s.fps_wall or None, 1), "/s", "frames, wall clock"),
         theme.cell(theme.number(s.fps_engine or None, 1), "/s", "frames, engine"),
@@ -90,14 +93,15 @@ def render(s: Snapshot | None, coming: str) -> str:
     lines = [line for line in _LINES.items() if line[0] != "ground truth" or s.trajectory_gt is not None]
     name = escape(" · ".join(filter(None, (s.sequence, s.preset))))
     notes = [theme.note(s.reason, color)] if s.reason else []
-    missed = [_count(n, what) for n, what in ((s.skipped, "skipped"), (s.lost_frames, "lost")) if n]
+    counts = (s.dropped, "left out to keep up"), (s.skipped, "skipped"), (s.lost_frames, "lost")
+    missed = [_count(n, what) for n, what in counts if n]
     if missed:
         notes.append(theme.note(", ".join(missed), theme.ESTIMATE))
     return (
         f'<div class="ec"><div class="ec-head">{theme.chip(coming or WORDS[s.state], color)}'
         f'<span class="ec-name dim" title="{name}">{name}</span></div>'
-        f'<div class="ec-row"><span>Frame <b>{s.frame}</b></span><span class="dim">{s.frame + 1} of {s.frames_total}, '
-        f'{done:.0f} %</span></div><div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
+        f'<div class="ec-row"><span>Frame <b>{s.frame}</b></span><span class="dim">{progress}</span></div>'
+        f'<div class="ec-bar"><i style="width:{done:.1f}%"></i></div>'
         f'<div class="ec-grid">{"".join(cells)}</div>{theme.legend(lines)}{"".join(notes)}</div>'
     )
 

@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl, quote, urlencode
 
 from ..types import InputError
 
-SYNTHETIC = "synthetic/"
+SYNTHETIC, CAMERA = "synthetic/", "camera/"
 READOUT, CALIBRATION, NONE = "readout", "calibration", "none"
 COMMON = (READOUT, CALIBRATION)  # what any recording takes
 

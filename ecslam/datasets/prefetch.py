@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import islice
 
 from ..cores import cores
@@ -52,6 +52,10 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
         index, future = self._pending.popleft()
         return index, future.result()
 
+    def ready(self, seconds: float) -> bool:
+        """Wait until ``next`` need not wait, no longer than so; whether that is so."""
+        return not self._pending or bool(wait([self._pending[0][1]], seconds).done)
+
     def close(self) -> None:
         """Stop reading; nothing more is yielded."""
         self._pending.clear()
@@ -63,10 +67,11 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
 
     def _submit(self, count: int) -> None:
         for index in islice(self._coming, count):
-            self._pending.append((index, self._pool.submit(_read, self._sequence, self._prepare, index)))
+            self._pending.append((index, self._pool.submit(read, self._sequence, self._prepare, index)))
 
 
-def _read(sequence: Sequence, prepare: Callable[[Frame], Frame], index: int) -> Frame | FrameError:
+def read(sequence: Sequence, prepare: Callable[[Frame], Frame], index: int) -> Frame | FrameError:
+    """A frame, prepared, or what is wrong with it."""
     try:
         return prepare(sequence[index])
     except FrameError as error:

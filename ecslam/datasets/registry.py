@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 from ..types import InputError, Sequence
-from .addresses import CALIBRATION, COMMON, NONE, READOUT, SYNTHETIC, absolute, split_address
+from .addresses import CALIBRATION, CAMERA, COMMON, NONE, READOUT, SYNTHETIC, absolute, split_address
 from .calibration import FILE, calibrated_by
 from .views import with_readout
 
@@ -68,6 +68,8 @@ def open_sequence(path_or_address: str | Path, **synthetic_options: Any) -> Sequ
         room = open_synthetic(address.removeprefix(SYNTHETIC), **synthetic_options)
         given = room.address.calibration
         return _as_told(cast(Sequence, room), address, {} if given is None else {CALIBRATION: given})
+    if address.startswith(CAMERA):
+        raise InputError(f"{address}: a camera can be run and recorded only; open what has been recorded")
     if synthetic_options:
         raise InputError(
             f"{address}: {', '.join(synthetic_options)} can be set for {SYNTHETIC}... only, not for a folder"

@@ -58,7 +58,7 @@ def open(path: Path) -> FileSequence:
     known = benchmark(path, _header(path / "rgb.txt"))
     camera, camera_notes = _camera(path, known, size)
     times = _seconds(images.times, known)
-    poses, pose_notes = _ground_truth(path, known, times)
+    poses, pose_notes = ground_truth(path, known, times)
     return FileSequence(
         name=path.name,
         layout=known.layout if known else "tum",
@@ -138,7 +138,7 @@ def _from_lists(path: Path) -> Images:
     """Of each list what is there, joined by time."""
     color_times, color_files = _read_list(path / "rgb.txt")
     depth_times, depth_files = _read_list(path / "depth.txt")
-    color, depth = _present(path, color_files), _present(path, depth_files)
+    color, depth = present(path, color_files), present(path, depth_files)
     pairs = associate(color_times[color], depth_times[depth], MAX_DIFFERENCE_S)
     if len(pairs) == 0:
         raise InputError(
@@ -146,7 +146,7 @@ def _from_lists(path: Path) -> Images:
             "on one clock?"
         )
     alone = len(color) - len(pairs), len(depth) - len(pairs)
-    notes = _notes_on_missing([*color_files, *depth_files], len(color) + len(depth))
+    notes = notes_on_missing([*color_files, *depth_files], len(color) + len(depth))
     if any(alone):
         notes = (*notes, f"{alone[0]} colour and {alone[1]} depth images have no partner within 20 ms and are left out")
     i, j = color[pairs[:, 0]], depth[pairs[:, 1]]
@@ -161,9 +161,9 @@ def _from_associations(path: Path) -> Images:
     places = {"color": (2, 3), "depth": (0, 1)} if depth_first else {"color": (0, 1), "depth": (2, 3)}
     times = to_times([row[places["depth"][0]] for row in rows], file)
     color, depth = ([listed_file(path, row[places[what][1]]) for row in rows] for what in ("color", "depth"))
-    seen, measured = _present(path, color), _present(path, depth)
+    seen, measured = present(path, color), present(path, depth)
     both = np.intersect1d(seen, measured)
-    notes = _notes_on_missing([*color, *depth], len(seen) + len(measured))
+    notes = notes_on_missing([*color, *depth], len(seen) + len(measured))
     return Images(times[both], [color[k] for k in both], [depth[k] for k in both], notes)
 
 
@@ -179,7 +179,7 @@ def _by_time(images: Images) -> Images:
     return Images(images.times[order], color, depth, (*images.notes, note))
 
 
-def _present(folder: Path, files: list[Path]) -> NDArray[np.int64]:
+def present(folder: Path, files: list[Path]) -> NDArray[np.int64]:
     """The indices of those that exist. Raises InputError when too many do not."""
     there = np.array([file.is_file() for file in files])
     if (~there).sum() > MOST_MISSING * len(files):
@@ -190,7 +190,8 @@ def _present(folder: Path, files: list[Path]) -> NDArray[np.int64]:
     return np.flatnonzero(there)
 
 
-def _notes_on_missing(files: list[Path], there: int) -> tuple[str, ...]:
+def notes_on_missing(files: list[Path], there: int) -> tuple[str, ...]:
+    """A note where ``there`` of the listed images are not all."""
     if there == len(files):
         return ()
     first = next(file for file in files if not file.is_file())
@@ -236,9 +237,11 @@ def _seconds(times: Times, known: Benchmark | None) -> Times:
     return times / known.frames_per_s if known is not None and numbered else times
 
 
-def _ground_truth(
+def ground_truth(
     path: Path, known: Benchmark | None, times: Times
 ) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """Poses [N, 4, 4] at ``times`` from the folder's ``groundtruth.txt``, NaN where it has none near, or None; and
+    notes on it. Raises InputError."""
     files = [each for each in (path / "groundtruth.txt", *sorted(path.glob(ICL_TRUTH))) if each.is_file()]
     if not files:
         return None, ()

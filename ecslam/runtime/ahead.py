@@ -11,11 +11,17 @@ from ..config import Config
 from ..types import Frame, Intrinsics
 
 
-def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -> Callable[[Frame], Frame]:
+def preparation(
+    config: Callable[[], Config],
+    camera: Intrinsics,
+    device: str,
+    number: Callable[[Frame], int] = lambda frame: frame.index,
+) -> Callable[[Frame], Frame]:
     """Smooth the depth of frames, look at its relief and at their light, find the corners of those that will need them,
     make keyframes of those whose turn it will be, and put images for a GPU where it can fetch them by itself.
 
-    config: asked for every frame. What is missing, or was found with other settings, is made good when it is needed.
+    config: asked for every frame. number: which frame of the run it will be, if all before it are of use. What is
+    missing, or was found with other settings, is made good when it is needed.
     """
 
     def prepare(frame: Frame) -> Frame:
@@ -30,7 +36,7 @@ def preparation(config: Callable[[], Config], camera: Intrinsics, device: str) -
             frame = replace(frame, relief=relief(frame.depth))
         if now.exposure:
             frame = replace(frame, light=light(frame.color))
-        turn = frame.index % now.keyframe_every == 0
+        turn = number(frame) % now.keyframe_every == 0
         if now.fus and (now.tracking.iterations > 0 or turn):
             frame = replace(frame, corners=find_corners(frame.color, now))
         if turn:

@@ -8,6 +8,7 @@ thread, which takes it up at the next frame boundary; meshes also in the middle 
 from __future__ import annotations
 
 import math
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -37,6 +38,7 @@ from ..messages import (
 from ..types import InputError
 
 MAX_WAITING = 16
+ENDLESS = sys.maxsize  # frames, while a camera is on
 GRACE_S = 1.5
 MIN_VOXEL_M = 0.004
 EXPORTS = {"mesh": ("ply", "glb", "obj"), "trajectory": ("tum", "kitti"), "keyframes": ("tum", "kitti")} | {
@@ -159,6 +161,8 @@ class Control:
 
     def _ahead(self) -> str:
         """Which frames are to come."""
+        if self._total == ENDLESS:
+            return f"those from {self.position} on lie ahead"
         return f"{self.position} .. {self._total - 1} lie ahead" if self.position < self._total else "none lies ahead"
 
     def _enqueue(self, command_id: int, command: RequestMesh | RequestPictures | Export) -> None:
@@ -203,12 +207,12 @@ class Control:
         wanted = self._started_with
         if command.preset not in (None, wanted.preset):
             other = config_files.for_layout(config_files.load_preset(command.preset), layout)
-            wanted = replace(other, seed=wanted.seed, schedule=wanted.schedule)
+            wanted = replace(other, seed=wanted.seed, schedule=wanted.schedule, realtime=wanted.realtime)
         elif layout != self._layout:
             preset = config_files.load_preset(wanted.preset)
             before, after = (config_files.for_layout(preset, name) for name in (self._layout, layout))
             wanted = config_files.apply(after, config_files.changes(before, wanted), "restart")
-        given = {"seed": command.seed, "schedule": command.schedule}
+        given = {"seed": command.seed, "schedule": command.schedule, "realtime": command.realtime}
         return config_files.apply(wanted, {k: v for k, v in given.items() if v is not None}, "restart")
 
     # ---- for the engine thread ------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ checkpoints; whoever steers only calls ``submit``.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,6 @@ from .. import config_files, datasets
 from ..config import Config
 from ..messages import Command, Event, Export, LoadPreset, Notice, RequestMesh, Snapshot, State, Tune
 from ..types import Frame, FrameError, InputError, Sequence, words
-from .ahead import preparation
 from .checkpoint import Checkpoint, load_checkpoint
 from .control import Control, Turn
 from .driven import Abandoned, SlamFactory, make_slam, out_of_memory
@@ -30,15 +29,17 @@ from .memory import keep_no_holes
 from .run import Plan, Run
 from .runfolder import RunFolder
 from .snapshots import state_of, take_snapshot
+from .supply import frames_of
 from .workshop import Workshop
 
 CHECKPOINT_EVERY = 5
 WATCHED_PERIOD_S, UNWATCHED_PERIOD_S = 1 / 30, 1 / 4
 LONG_STEP_S = 0.5
 PATIENCE_S = 5.0
+PATIENCE_FOR_FRAME_S = 0.05  # then commands are looked at again
 PREPARING = "Preparing: the first run on a machine compiles its kernels, which takes about a minute"
 
-Items = Iterator[tuple[int, Frame | FrameError]]
+Items = datasets.Prefetch | datasets.KeepingUp
 
 
 class Engine:
@@ -82,7 +83,7 @@ class Engine:
         self._plan, self._run = plan, self._open_run(plan, resumed)
         self._workshop = workshop = Workshop(self._feed)
         self._control = Control(config, self._feed.publish, self._sequences, self.presets, lambda: workshop.waiting)
-        self._control.begin(config, opened.layout, len(plan.sequence), self._run.tally.position)
+        self._control.begin(config, opened.layout, plan.total, self._run.tally.position)
 
     @classmethod
     def resume(cls, folder: Path, *, sequence: Sequence | str | None = None, **options: Any) -> Engine:
@@ -106,6 +107,11 @@ class Engine:
     def presets(self) -> tuple[str, ...]:
         """Names that ``Restart`` and ``LoadPreset`` accept."""
         return tuple(config_files.preset_names())
+
+    @property
+    def live(self) -> bool:
+        """Whether its frames come from a camera that is on."""
+        return self._plan.live is not None
 
     @property
     def run_folder(self) -> Path:
@@ -179,7 +185,7 @@ class Engine:
                 opened = self._given.get(command.sequence) or self._open_sequence(command.sequence)
                 plan = replace(plan, sequence=opened, address=command.sequence, frames="")
             plan = replace(plan, config=self._control.restart_config(command, plan.sequence.layout))
-            self._control.begin(plan.config, plan.sequence.layout, len(plan.sequence))
+            self._control.begin(plan.config, plan.sequence.layout, plan.total)
             self._plan, self._run = plan, self._open_run(plan)
         except (InputError, OSError) as error:
             self._control.begin(self._plan.config, self._plan.sequence.layout, 0)
@@ -198,9 +204,7 @@ class Engine:
         else:
             folder = RunFolder.reopen(plan.out, self._not_saved)
         run = Run(plan, folder, self._emit, self._make, self._checkpoint_every, resumed)
-        coming = range(run.tally.position, len(plan.sequence))
-        prepare = preparation(lambda: run.config, plan.sequence.intrinsics, plan.device)
-        self._ahead = datasets.Prefetch(plan.sequence, coming, prepare=prepare)
+        self._ahead = frames_of(run)
         return run
 
     def _one_run(self) -> Turn:
@@ -218,6 +222,8 @@ class Engine:
         except Exception as error:
             self._failed(error)
         patience.cancel()
+        if turn is not Turn.RESTART:
+            run.end_live()
         self._control.end()
         try:
             self._finish(run, turn)
@@ -246,13 +252,14 @@ class Engine:
     def _ended(self, run: Run, turn: Turn) -> str:
         if self.error is not None:
             return "failed"
-        if turn is Turn.STOP and run.tally.position < len(run.plan.sequence):
+        if turn is Turn.STOP and run.live is None and run.tally.position < len(run.plan.sequence):
             return "stopped"
         return "finished" if turn is Turn.STOP and not run.torn else "interrupted"
 
     def _frames(self, run: Run, frames: Items) -> Turn:
         """Step through the frames as the commands want it; what ended that (STOP also at the sequence's end)."""
         interrupt, last_step = self._interrupt(run, lambda: self._control.leave_now), -1e9
+        run.warm_up()
         while True:
             run.clock.pause()
             turn = self._control.next_turn(last_step)
@@ -265,6 +272,8 @@ class Engine:
                 self._work(run)
             elif turn is not Turn.STEP:
                 return turn
+            elif not frames.ready(PATIENCE_FOR_FRAME_S):
+                self._show_when_due(state_of(run))
             else:
                 last_step = monotonic()
                 item = next(frames, None)
@@ -297,8 +306,7 @@ class Engine:
         self._control.stepped(run.tally.position, report is not None and report.loop is not None)
         self._in_between(run)
         self._workshop.keep(run)
-        if monotonic() >= self._next_snapshot:
-            self._show(state_of(run))
+        self._show_when_due(state_of(run))
 
     def _ask_for_patience(self) -> None:
         """Before the second iteration of the first mapping, when all kernels that it takes have been compiled."""
@@ -309,6 +317,10 @@ class Engine:
         error = out_of_memory(error, self._run.config, self._run.plan.device) or error
         self.error = self.error or error
         self._run.notice("error", words(error))
+
+    def _show_when_due(self, state: State) -> None:
+        if monotonic() >= self._next_snapshot:
+            self._show(state)
 
     def _show(self, state: State, reason: str = "") -> None:
         self._next_snapshot = monotonic() + (WATCHED_PERIOD_S if self._feed.watched else UNWATCHED_PERIOD_S)

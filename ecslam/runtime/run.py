@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .. import config_files
 from ..config import Config
+from ..datasets import Live
 from ..datasets.check import lacking_depth, odd_depth
 from ..datasets.views import in_order, problems
 from ..evaluation.trajectory import Spread, absolute_error
@@ -23,7 +24,8 @@ from ..types import Frame, FrameError, InputError, Sequence
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
 from .continued import camera_of, require_same_camera, require_same_times
-from .driven import Abandoned, SlamFactory, SlamLike
+from .control import ENDLESS
+from .driven import Abandoned, SlamFactory, SlamLike, import_slam
 from .driven import State as Arrays
 from .memory import return_holes
 from .meshjobs import MESH_POINTS, FrozenMap
@@ -52,6 +54,17 @@ class Plan:
     device: str
     out: Path
 
+    @property
+    def live(self) -> Live | None:
+        """The sequence, while its camera is on, or where that has brought nothing."""
+        s = self.sequence
+        return s if isinstance(s, Live) and not (s.over() and len(s)) else None
+
+    @property
+    def total(self) -> int:
+        """How many frames there are to do; no end of them while a camera is on."""
+        return len(self.sequence) if self.live is None else ENDLESS
+
 
 class Run:
     """The state of one run. emit: takes events for the world. See the module."""
@@ -65,7 +78,7 @@ class Run:
         checkpoint_every: int,
         resumed: Checkpoint | None = None,
     ) -> None:
-        self.plan, self.folder, self.config = plan, folder, plan.config
+        self.plan, self.folder, self.config, self.live = plan, folder, plan.config, plan.live
         self.slam: SlamLike | None = None
         self.tally = Tally(**resumed.meta["tally"]) if resumed else Tally()
         self.clock = Stopwatch(self.tally.wall_s)
@@ -136,12 +149,13 @@ class Run:
         if self.tally.position == 0:
             for text in problems(self.plan.sequence):
                 self.warn(text)
+        self.tally.dropped += index - self.tally.position
         self.tally.position = index + 1
         if isinstance(item, FrameError):
             self.tally.unreadable.append(str(item))
             self._skip(index, str(item))
             return None
-        if not self._in_order[index]:
+        if not self._in_order[index : index + 1].all():  # what came after the run began is in order
             self._skip(index, f"frame {index} is not in the order of time ({item.timestamp:.6f} s)")
             return None
         if self._color is None and (odd := odd_depth(item.depth, self._used_m)):
@@ -208,8 +222,25 @@ class Run:
         if self.tally.none_usable(frames):
             self.require_frames()
 
+    def warm_up(self) -> None:
+        """Load what takes seconds before there is a frame, so that a camera's first one does not grow old meanwhile."""
+        if self.live is not None or self.config.realtime:
+            import_slam()
+        if self.live is not None and self.slam is None:
+            self._build(None, None)
+
+    def end_live(self) -> None:
+        """Switch the camera off, where there is one, and tell what went wrong with it."""
+        if self.live is not None:
+            self.live.close()
+            self.folder.write("run.json", read_about(self.folder.path) | {"frames_total": len(self.plan.sequence)})
+            if self.live.trouble:
+                self.warn(self.live.trouble)
+
     def require_frames(self) -> None:
         """Raises InputError when no frame so far could be used."""
+        if self.live is not None and self.live.trouble and not self.tally.position:
+            raise InputError(self.live.trouble)
         if not self.tally.rows:
             raise InputError(
                 f"{self.plan.address}: none of {self.tally.position} frames could be used, the first because: "

@@ -40,6 +40,7 @@ def summarise(run: Run, ended: str, error: str, export_s: float) -> dict[str, An
         "parameters_mb": round(parameters * 4 / 1e6, 3),
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "skipped_frames": tally.skipped,
+        "dropped_frames": tally.dropped,
         "lost_frames": tally.lost,
         "loop_closures": tally.loops,
         "unreadable_frames": tally.unreadable,

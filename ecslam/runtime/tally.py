@@ -20,9 +20,9 @@ class Tally:
 
     position: frames of the sequence done, skipped ones included. rows: frame index of each pose of the trajectory.
     unreadable: a sentence for each frame that could not be read; first_skip: why the first one was left out; warnings:
-    what a person should know besides. wall_s: seconds spent, pauses left out, and
-    setup_s: seconds that loading the engine's libraries took before, also left out. engine_ms:
-    tracking and mapping without the first frame (its initialisation), as Co-SLAM counts.
+    what a person should know besides. dropped: frames that came while the engine was busy, in real time. wall_s:
+    seconds spent, pauses left out, and setup_s: seconds that loading the engine's libraries took before, also left
+    out. engine_ms: tracking and mapping without the first frame (its initialisation), as Co-SLAM counts.
     """
 
     position: int = 0
@@ -32,6 +32,7 @@ class Tally:
     first_skip: str = ""
     warnings: list[str] = field(default_factory=list)
     skipped: int = 0
+    dropped: int = 0
     lost: int = 0
     loops: int = 0
     wall_s: float = 0.0
@@ -71,7 +72,7 @@ class Tally:
 
         A frame that is still at work has no pose yet and is left out.
         """
-        done = np.arange(len(self.rows) + self.skipped)
+        done = np.arange(len(self.rows) + self.skipped + self.dropped)
         rows = np.searchsorted(np.array(self.rows, np.int64), done, side="right") - 1
         return rows.clip(0)
 
@@ -84,23 +85,23 @@ class Stopwatch:
     """Seconds between each ``resume`` and ``pause``; it begins paused."""
 
     def __init__(self, already_s: float = 0.0) -> None:
-        self._total_s = already_s
-        self._since: float | None = None
+        self._now: tuple[float, float | None] = already_s, None
 
     @property
     def seconds(self) -> float:
-        """The time so far."""
-        return self._total_s + (monotonic() - self._since if self._since is not None else 0.0)
+        """The time so far. Any thread may ask."""
+        total_s, since = self._now
+        return total_s + (monotonic() - since if since is not None else 0.0)
 
     def pause(self) -> bool:
         """Stop counting; whether it was."""
-        was = self._since is not None
-        self._total_s, self._since = self.seconds, None
+        was = self._now[1] is not None
+        self._now = self.seconds, None
         return was
 
     def resume(self) -> None:
         """Count again."""
-        self._total_s, self._since = self.seconds, monotonic()
+        self._now = self.seconds, monotonic()
 
 
 class Every:
