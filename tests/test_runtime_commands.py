@@ -335,6 +335,12 @@ def test_pictures_of_the_newest_and_of_an_earlier_frame(tmp_path):
         assert "has not been processed" in watch.event(Notice).text
 
 
+def test_pictures_of_a_frame_that_was_left_out_are_those_of_the_one_before(tmp_path):
+    with running(tmp_path, FakeSequence(30, bad=(4, 5)), paused_at=9) as (_, watch, __):
+        watch.ask(RequestPictures(5))
+        assert watch.event(FramePictures).frame == 3
+
+
 def test_what_pictures_took_leaves_out_the_frame_that_they_wait_for(tmp_path):
     behaviour = Behaviour()
     with running(tmp_path, paused_at=3, behaviour=behaviour) as (_, watch, __):

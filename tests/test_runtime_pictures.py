@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ecslam.runtime.pictures import SCALE_BOTTOM, SCALE_LEFT, SCALE_RIGHT, SCALE_TOP, shrink, six_pictures
+from ecslam.runtime.pictures import SCALE_BOTTOM, SCALE_LEFT, SCALE_RIGHT, SCALE_TOP, shrink, shrink_depth, six_pictures
 
 
 def test_the_difference_of_depth_says_which_colour_stands_for_how_much():
@@ -30,6 +30,16 @@ def test_a_small_picture_shows_all_of_it(size, expected):
     assert abs(float(small[..., 1].mean()) - image[..., 1].mean()) < 3
     assert small[0, -1, 1] > 250 - 255 * edge / size[1] > small[0, 0, 1]
     assert (small[..., 2] == 7).all()
+
+
+@pytest.mark.parametrize("size", [(480, 640), (480, 631), (680, 1200), (3, 321), (48, 64)])
+def test_depth_gets_the_size_of_colour_whatever_that_is(size):
+    depth = np.arange(size[0] * size[1], dtype=np.float32).reshape(size)
+    color = shrink(np.zeros((*size, 3), np.uint8), 320)
+    small = shrink_depth(depth, color)
+    assert small.shape == color.shape[:2]
+    assert np.isin(small, depth).all(), "none is made up"
+    assert six_pictures(0, color, small, color, small).depth_difference.shape == color.shape
 
 
 def test_a_picture_that_is_small_enough_stays():

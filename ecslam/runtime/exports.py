@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -93,15 +94,19 @@ def zip_run(folder: Path, name: str) -> Path:
 
 
 def render_pictures(run: Run, frame: int | None) -> FramePictures:
-    """The six pictures of a processed frame (None: the newest). Raises InputError."""
-    if run.slam is None or not run.tally.rows or run.slam.field is None:
+    """The six pictures of a frame (None: the newest), or of the last one before it where that was left out. Raises
+    InputError."""
+    rows = run.tally.rows
+    if run.slam is None or not rows or run.slam.field is None:
         raise InputError("there is no picture yet; wait for the first frame")
-    wanted = run.tally.rows[-1] if frame is None else frame
-    if wanted not in run.tally.rows:
-        raise InputError(f"frame {wanted} has not been processed; there are 0 .. {run.tally.rows[-1]}")
+    wanted = rows[-1] if frame is None else frame
+    if not rows[0] <= wanted <= rows[-1]:
+        raise InputError(f"frame {wanted} has not been processed; there are {rows[0]} .. {rows[-1]}")
     began = monotonic()
-    source = run.plan.sequence[wanted]
-    color, depth = shrink(source.color, PICTURE_WIDTH), shrink_depth(source.depth, PICTURE_WIDTH)
-    color_rendered, depth_rendered = run.slam.render(run.poses()[run.tally.rows.index(wanted)], depth)
-    pictures = six_pictures(wanted, color, depth, color_rendered, depth_rendered)
+    row = bisect_right(rows, wanted) - 1
+    source = run.plan.sequence[rows[row]]
+    color = shrink(source.color, PICTURE_WIDTH)
+    depth = shrink_depth(source.depth, color)
+    color_rendered, depth_rendered = run.slam.render(run.poses()[row], depth)
+    pictures = six_pictures(rows[row], color, depth, color_rendered, depth_rendered)
     return replace(pictures, took_s=monotonic() - began)

@@ -27,11 +27,9 @@ def jpeg(image: NDArray[np.uint8]) -> bytes:
     return encoded.tobytes()
 
 
-def shrink_depth(depth: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """A depth image at most ``width`` pixels wide; nearest pixels, so that no depth is made up."""
-    if depth.shape[1] <= width:
-        return depth
-    height = max(1, round(depth.shape[0] * width / depth.shape[1]))
+def shrink_depth(depth: NDArray[np.float32], like: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """A depth image at the size of the picture ``like`` [h, w, 3]; nearest pixels, so that no depth is made up."""
+    height, width = like.shape[:2]
     return np.asarray(cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
 
 
