@@ -12,6 +12,7 @@ from . import se3
 
 ROOM = 64
 UNEVEN, MOST_STEPS = 0.3, 15.0  # steps of time: less than this from one is jitter; half a second of a usual camera
+MOST_BACK = 6  # poses
 
 
 class Trajectory:
@@ -57,10 +58,14 @@ class Trajectory:
         return np.asarray(self._keyframes[self._anchor[: self._count]] @ self._relative[: self._count])
 
     def predict(self, timestamp: float) -> NDArray[np.float64]:
-        """Constant-velocity guess [4, 4] for a frame at ``timestamp`` seconds, after frames that are missing, too."""
+        """Constant-velocity guess [4, 4] for a frame at ``timestamp`` seconds, after frames that are missing, too: the
+        farther ahead it is, the longer is what the velocity is taken over, or its error would be multiplied."""
         if len(self) < 2:
             return self[-1]
-        motion, (before, last) = se3.inverse(self[-2]) @ self[-1], self.timestamps[-2:]
+        last, back = self.timestamps[-1], 2
+        while back < min(len(self), MOST_BACK) and last - self.timestamps[-back] < (1 - UNEVEN) * (timestamp - last):
+            back += 1
+        motion, before = se3.inverse(self[-back]) @ self[-1], self.timestamps[-back]
         steps = (timestamp - last) / (last - before) if last > before else 1.0
         if abs(steps - 1) > UNEVEN:
             motion = se3.repeated(motion, min(max(steps, 0.0), MOST_STEPS))

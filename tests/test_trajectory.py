@@ -60,10 +60,26 @@ def test_prediction_counts_on_missing_frames(steps, expected):
     assert np.allclose(found[:3, :3], se3.so3_exp(turn))
 
 
+def test_prediction_far_ahead_looks_as_far_back():
+    """What the last short step is off by does not count several times over."""
+    t = Trajectory()
+    for time in (0, 2, 4, 5):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.01 * time, 0.004 * (time == 5), 0
+        t.append(pose, time / 30, keyframe=time == 0)
+    assert np.allclose(t.predict(8 / 30)[:3, 3], [0.08, 0.008, 0]), "the last three steps of time count, not one"
+    assert np.allclose(t.predict(6 / 30)[:3, 3], [0.06, 0.008, 0])
+
+
 def test_prediction_after_frames_at_one_time_goes_on_as_before():
+    t = Trajectory()
+    for x in (0.0, 0.1):
+        t.append(moved(x), 5.0, keyframe=x == 0)
+    assert np.allclose(t.predict(6.0), moved(0.2))
     t = build()
-    t.append(moved(1.3), t.timestamps[-1], keyframe=False)
-    assert np.allclose(t.predict(t.timestamps[-1] + 1), t[-1] @ se3.inverse(t[-2]) @ t[-1])
+    last, step = t.timestamps[-1], t.timestamps[-1] - t.timestamps[-2]
+    t.append(moved(1.3), last, keyframe=False)
+    assert np.allclose(t.predict(last + step), moved(1.3 + 0.3)), "velocity is taken from before"
 
 
 def test_prediction_goes_on_along_a_curve():
