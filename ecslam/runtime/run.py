@@ -109,7 +109,7 @@ class Run:
             self._build(None, resumed.arrays)
             require_same_times(plan.address, plan.sequence, self.tally, self.timestamps())
             folder.go_on(resumed.frame)
-            folder.write("run.json", about | {"sequence": plan.address})
+            folder.write("run.json", about | {"sequence": plan.address, "frames_total": len(plan.sequence)})
             self.loops = folder.loops()
             self.measure()
         else:
