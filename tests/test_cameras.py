@@ -129,6 +129,19 @@ def test_a_camera_that_fails_ends_the_recording_and_keeps_it(tmp_path):
     assert len(open_sequence(tmp_path / "a")) == 2
 
 
+def test_a_camera_that_breaks_in_an_unknown_way_ends_the_recording_too(tmp_path):
+    camera = FakeCamera([shot(0)], error="x")
+    camera.read = lambda: 1 / 0
+    camera.close = lambda: 1 / 0
+    live = recorded(tmp_path / "a", camera)
+    assert live.trouble == "division by zero"
+
+
+def test_images_that_cannot_be_encoded_end_the_recording(tmp_path):
+    live = recorded(tmp_path / "a", FakeCamera([shot(0)._replace(depth=np.zeros((0, 0), np.uint16))]))
+    assert "ends at frame 0" in live.trouble
+
+
 def test_a_full_disk_ends_the_recording_and_says_where(tmp_path, monkeypatch):
     whole = Path.write_bytes
 

@@ -188,6 +188,14 @@ def test_a_restart_begins_with_what_the_camera_sees_now_and_after_it_with_the_wh
         assert frames_of(engine.run_folder) == list(range(8))
 
 
+def test_going_over_to_another_sequence_switches_the_camera_off(tmp_path):
+    camera = FakeCamera().see(2)
+    with running(tmp_path / "a", camera, Behaviour(), sequences=("fake:5",)) as (_, watch, __):
+        watch.until(lambda m: isinstance(m, Snapshot) and m.frame == 1)
+        last = watch.go(Restart(sequence="fake:5"), State.FINISHED)
+        assert (last.frames_total, last.live, camera.closed) == (5, False, 1)
+
+
 def test_leaving_switches_the_camera_off(tmp_path):
     camera = FakeCamera().see(2)
     with running(tmp_path, camera, Behaviour()) as (_, watch, __):

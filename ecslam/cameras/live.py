@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..datasets.images import to_metres
 from ..datasets.recording import Recording
-from ..types import InputError
+from ..types import words
 from .camera import Camera, Shot
 from .writer import Writer
 
@@ -66,11 +67,12 @@ class LiveRecording(Recording):
                 if shot is None:
                     break
                 self._add(shot)
-        except InputError as error:
-            self._failure = str(error)
-        finally:
             self._camera.close()
-            self._over.set()
+        except Exception as error:
+            self._failure = words(error)
+            with suppress(Exception):  # what has failed may fail at this, too
+                self._camera.close()
+        self._over.set()
 
     def _add(self, shot: Shot) -> None:
         index = len(self.times)

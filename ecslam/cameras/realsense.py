@@ -40,22 +40,27 @@ class RealSense:
             self._require_camera(serial)
             config.enable_stream(library.stream.depth, *size, library.format.z16, fps)
             config.enable_stream(library.stream.color, *size, library.format.rgb8, fps)
-        if serial:
-            config.enable_device(serial)
+            if serial:
+                config.enable_device(serial)
         self._pipeline = library.pipeline()
         try:
             started = self._pipeline.start(config)
         except RuntimeError as error:
             what = f"file={file}" if file else f"size={size[0]}x{size[1]}&fps={fps}"
+            why = " ".join(str(error).split())
             raise InputError(
-                f"camera/realsense: {what} does not work ({error}); `rs-enumerate-devices` lists what does"
+                f"camera/realsense: {what} does not work ({why}); `rs-enumerate-devices` lists what does"
             ) from None
         if file:
             self._played = started.get_device().as_playback()
             self._played.set_real_time(False)  # it leaves frames out where they are not taken at once
-        self.rig = self._rig(started)
-        for _ in range(0 if file else EXPOSING):
-            self.read()
+        try:
+            self.rig = self._rig(started)
+            for _ in range(0 if file else EXPOSING):
+                self.read()
+        except BaseException:
+            self.close()
+            raise
 
     def read(self) -> Shot | None:
         """See ``Camera``."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..datasets.recording import FILE, TIMES, Rig, color_file, depth_file, write_rig
-from ..types import InputError
+from ..types import InputError, words
 from .camera import Shot
 
 MOST_WAITING = 60  # shots, two seconds of most cameras
@@ -58,9 +58,9 @@ class Writer:
             if not self.failure:
                 try:
                     self._write(*item)
-                except OSError as error:
-                    why = error.strerror
-                    self.failure = f"{self._folder}: the recording ends at frame {item[0]} ({why}); make room"
+                except Exception as error:
+                    why = f"{error.strerror}); make room" if isinstance(error, OSError) else f"{words(error)})"
+                    self.failure = f"{self._folder}: the recording ends at frame {item[0]} ({why}"
 
     def _write(self, index: int, shot: Shot) -> None:
         name = f"{index:06d}"

@@ -75,7 +75,7 @@ class KeepingUp(Iterator[tuple[int, Frame | FrameError]]):
     catch up. Whoever is more than ``CATCH_UP`` such strides behind gets longer ones.
 
     prepare: what the thread that reads makes of each frame. A frame that cannot be read is yielded as a FrameError.
-    ``close``, or dropping the iterator, ends it, and waits for the read under way.
+    ``close`` ends it, and waits for the read under way.
     """
 
     def __init__(

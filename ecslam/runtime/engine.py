@@ -185,6 +185,8 @@ class Engine:
                 opened = self._given.get(command.sequence) or self._open_sequence(command.sequence)
                 plan = replace(plan, sequence=opened, address=command.sequence, frames="")
             plan = replace(plan, config=self._control.restart_config(command, plan.sequence.layout))
+            if self._run.live is not None and plan.sequence is not self._plan.sequence:
+                self._run.live.close()
             self._control.begin(plan.config, plan.sequence.layout, plan.total)
             self._plan, self._run = plan, self._open_run(plan)
         except (InputError, OSError) as error:
