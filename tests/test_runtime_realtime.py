@@ -68,9 +68,9 @@ def test_a_recording_is_played_in_its_own_time_and_frames_are_left_out(tmp_path)
     summary = made.run()
     assert time.monotonic() - began > 0.35
     done = frames_of(tmp_path)
-    assert done[0] < 3
+    assert done[0] < 30
     assert done[-1] == 119
-    assert 4 < len(done) < 30
+    assert 3 < len(done) < 60
     assert summary["frames"] == len(done)
     assert summary["dropped_frames"] == 120 - len(done)
     assert summary["ended"] == "finished"
@@ -81,9 +81,9 @@ def test_a_recording_is_played_in_its_own_time_and_frames_are_left_out(tmp_path)
 
 
 def test_an_engine_that_is_fast_enough_leaves_nothing_out(tmp_path):
-    sequence = FakeSequence(20, times=np.arange(20) / 60)
+    sequence = FakeSequence(5, times=np.arange(5) / 5)
     summary = Engine(REALTIME, sequence, tmp_path, make=maker(Behaviour()), open_sequence=open_fake).run()
-    assert (summary["frames"], summary["dropped_frames"]) == (20, 0)
+    assert (summary["frames"], summary["dropped_frames"]) == (5, 0)
 
 
 def test_a_pause_stops_the_recording_too(tmp_path):
@@ -130,6 +130,7 @@ def test_a_camera_is_a_live_sequence():
 def test_a_camera_is_followed_until_it_is_stopped_and_the_map_is_completed(tmp_path):
     camera = FakeCamera().see(1)
     with running(tmp_path, camera, Behaviour()) as (engine, watch, made):
+        assert "hold it still" in watch.event(Notice).text
         watch.until(lambda m: isinstance(m, Snapshot) and m.live and len(m.trajectory) == 1)
         camera.see(3)
         watch.until(lambda m: isinstance(m, Snapshot) and m.frame == 3 and m.frames_total == 4)

@@ -40,6 +40,7 @@ THUMBNAIL_WIDTH = 160
 PICTURE_WIDTH = 320
 MOST_WARNINGS = 100
 EACH_SKIP, MANY_SKIPS = 20, 100  # skipped frames that are told one by one, and then every how many
+HOLD_STILL = "the camera is on: hold it still until the first map appears, a second or two"
 GOOD_NEWS = ("relocalised", "recovered", MOVING)
 
 
@@ -228,6 +229,7 @@ class Run:
             import_slam()
         if self.live is not None and self.slam is None:
             self._build(None, None)
+            self.notice("info", HOLD_STILL)
 
     def end_live(self) -> None:
         """Switch the camera off, where there is one, and tell what went wrong with it."""
