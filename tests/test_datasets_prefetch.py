@@ -54,6 +54,14 @@ def test_frames_come_in_order_and_once(workers: int, ahead: int) -> None:
     assert probe.most_together <= workers
 
 
+def test_it_says_whether_the_next_frame_is_there() -> None:
+    frames = Prefetch(Probe(2, delay_s=0.2), threads=1)  # type: ignore[arg-type]
+    assert not frames.ready(0.01)
+    assert frames.ready(5)
+    assert [index for index, _ in frames] == [0, 1]
+    assert frames.ready(0), "that there is none more is known, too"
+
+
 def test_two_workers_read_at_the_same_time() -> None:
     probe = Probe(12, delay_s=0.005)
     run(probe, threads=2)

@@ -54,7 +54,10 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
 
     def ready(self, seconds: float) -> bool:
         """Wait until ``next`` need not wait, no longer than so; whether that is so."""
-        return not self._pending or bool(wait([self._pending[0][1]], seconds).done)
+        if not self._pending:
+            return True
+        _, coming = self._pending[0]
+        return coming.done() or bool(wait([coming], seconds).done)
 
     def close(self) -> None:
         """Stop reading; nothing more is yielded."""
