@@ -539,6 +539,13 @@ def test_only_frames_that_were_missed_are_counted(engine, skipped, lost, says):
     assert "0 frames" not in html
 
 
+def test_a_camera_that_is_on_is_told_with_how_far_the_run_is_behind_it(engine):
+    html = render(replace(engine.snapshot(), live=True, frames_total=14, dropped=12), "")
+    assert "camera on, 13 behind" in html
+    assert "of 14" not in html
+    assert "12 frames left out to keep up" in html
+
+
 def test_where_there_is_no_figure_there_is_a_dash_without_a_unit(engine):
     none = {"fps_wall": 0.0, "fps_engine": 0.0, "ate_cm": None, "track_ms": 0.0, "map_ms": 0.0, "memory_mb": 0.0}
     html = render(replace(engine.snapshot(), preset="", **none), "")

@@ -69,6 +69,14 @@ def test_after_the_last_frame_stop_needs_no_question(page, viewer):
     assert not asked(page)
 
 
+def test_a_camera_has_no_last_frame_so_stop_asks_always(page, viewer):
+    page.hub._take(replace(page.engine.snapshot(), frame=59, live=True))
+    assert until(lambda: page.hub.current.live)
+    press(page, viewer, "Run", "Stop")
+    assert until(lambda: asked(page))
+    assert m.Stop() not in page.engine.log
+
+
 @pytest.mark.parametrize("change", [{"state": m.State.FINISHED}, {"frame": 0}], ids=["the end", "a new run"])
 def test_a_question_about_a_run_that_is_over_goes_away(page, viewer, change):
     press(page, viewer, "Run", "Stop")
