@@ -53,7 +53,7 @@ def test_a_frame_that_is_near_comes_next_whole():
 
 
 def test_who_is_far_behind_gets_longer_strides():
-    behind = 600
+    behind = 300
     feed = Feed(1)
     with closing(KeepingUp(FakeSequence(behind + 1), feed)) as frames:
         next(frames)
@@ -62,6 +62,14 @@ def test_who_is_far_behind_gets_longer_strides():
     assert strides[0] == behind // CATCH_UP
     assert (np.diff(strides[:-1]) <= 0).all(), "they shorten as it catches up"
     assert strides[-2] == int(STRIDE_S * FPS)
+
+
+def test_after_a_long_pause_it_goes_on_with_the_newest_frame():
+    feed = Feed(1)
+    with closing(KeepingUp(FakeSequence(600), feed)) as frames:
+        next(frames)
+        feed.count, feed.ended = 600, True
+        assert [index for index, _ in frames] == [599]
 
 
 def test_it_begins_with_the_newest_frame():

@@ -16,6 +16,7 @@ from .views import in_order
 POLL_S = 0.002
 STRIDE_S = 0.14  # between two frames at most, as long as that is enough to keep up
 CATCH_UP = 12  # the most strides to be behind
+LEAP_S = 1.0  # a longer stride than this is a leap for tracking in any case
 
 
 class Arrivals(Protocol):
@@ -72,7 +73,8 @@ class KeepingUp(Iterator[tuple[int, Frame | FrameError]]):
 
     The newest frame comes next if it is at most ``STRIDE_S`` later than the one before, else the last one that is: a
     camera is followed more surely over several short ways than over a long one, and tracking alone is fast enough to
-    catch up. Whoever is more than ``CATCH_UP`` such strides behind gets longer ones.
+    catch up. Whoever is more than ``CATCH_UP`` such strides behind gets longer ones, and who would get some of over
+    ``LEAP_S``, as after a pause, the newest frame.
 
     prepare: what the thread that reads makes of each frame. A frame that cannot be read is yielded as a FrameError.
     ``close`` ends it, and waits for the read under way.
@@ -147,4 +149,6 @@ class KeepingUp(Iterator[tuple[int, Frame | FrameError]]):
         since_s = self._sequence.timestamps()[self._next - 1 : arrived]
         since_s = since_s - since_s[0]
         reach_s = max(STRIDE_S, since_s[-1] / CATCH_UP)
+        if reach_s > LEAP_S:
+            return arrived - 1
         return self._next - 1 + max(int(np.searchsorted(since_s, reach_s, side="right")) - 1, 1)
