@@ -98,10 +98,10 @@ def run(
     no_browser: NoBrowser = False,
 ) -> None:
     """Run SLAM on a recording, a built-in room or a camera; watch it in the browser unless --headless."""
-    from . import commands
+    from . import camera_commands, commands
 
     offered = commands.offered(data or [])
-    with commands.source(sequence, frames, record) as (address, opened):
+    with camera_commands.source(sequence, frames, record) as (address, opened):
         wanted = [*(settings or []), *(["realtime=true"] if realtime else [])]
         resolved = resolve_config(preset, opened, config, wanted, seed, schedule)
         folder = out or commands.unused(Path("runs") / f"{opened.name.replace('/', '-')}-{resolved.preset}")
@@ -119,9 +119,9 @@ def record(
     seconds: Annotated[float, typer.Option(min=0, help="How long; 0 = until Ctrl-C.")] = 0.0,
 ) -> None:
     """Record what a camera sees, for `ecslam run` later. `ecslam run camera/...` does so while it maps."""
-    from . import commands
+    from . import camera_commands
 
-    commands.record(camera, folder, seconds)
+    camera_commands.record(camera, folder, seconds)
 
 
 @app.command()

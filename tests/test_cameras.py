@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ecslam import cli, commands
+from ecslam import camera_commands, cli
 from ecslam.cameras import LiveRecording, Shot, is_camera, kinds, open_camera, recording_name, writer
 from ecslam.datasets import Live, open_sequence
 from ecslam.datasets.recording import Rig, read_rig, write_rig
@@ -265,22 +265,22 @@ def test_a_recording_is_named_after_its_camera_and_time():
 
 def test_a_camera_is_recorded_by_one_command(tmp_path, on_offer, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    commands.record("camera/fake", None, 0.0)
+    camera_commands.record("camera/fake", None, 0.0)
     (folder,) = (tmp_path / "recordings").iterdir()
     assert len(open_sequence(folder)) == 12
     assert f"12 frames; run them with: ecslam run {folder}" in capsys.readouterr().out
-    commands.record("camera/fake?rate=1", tmp_path / "named", 5.0)
+    camera_commands.record("camera/fake?rate=1", tmp_path / "named", 5.0)
     assert len(open_sequence(tmp_path / "named")) == 12
     with pytest.raises(InputError, match="no camera"):
-        commands.record(str(folder), None, 0.0)
+        camera_commands.record(str(folder), None, 0.0)
 
 
 def test_recording_ends_when_its_time_is_over(tmp_path, monkeypatch):
     camera = FakeCamera([shot(0, i / 30) for i in range(1000)], wait=True)
     threading.Thread(target=lambda: [time.sleep(0.02) or camera.go.release() for _ in range(100)], daemon=True).start()
-    monkeypatch.setattr(commands, "open_camera", lambda address: camera)
+    monkeypatch.setattr(camera_commands, "open_camera", lambda address: camera)
     began = time.monotonic()
-    commands.record("camera/realsense", tmp_path / "a", 0.3)
+    camera_commands.record("camera/realsense", tmp_path / "a", 0.3)
     assert 0.2 < time.monotonic() - began < 10
     assert camera.closed
 
@@ -288,14 +288,14 @@ def test_recording_ends_when_its_time_is_over(tmp_path, monkeypatch):
 def test_a_camera_is_off_again_when_its_images_cannot_be_written(tmp_path, on_offer):
     (tmp_path / "a").touch()
     with pytest.raises(InputError, match="name a new folder"):
-        commands.record("camera/fake", tmp_path / "a", 0.0)
+        camera_commands.record("camera/fake", tmp_path / "a", 0.0)
     assert on_offer[0].closed
 
 
 def test_options_that_do_not_go_together_are_refused(tmp_path):
-    with pytest.raises(InputError, match="--frames"), commands.source("camera/realsense", "0:5", None):
+    with pytest.raises(InputError, match="--frames"), camera_commands.source("camera/realsense", "0:5", None):
         pass
-    with pytest.raises(InputError, match="--record"), commands.source("synthetic/studio", "", tmp_path):
+    with pytest.raises(InputError, match="--record"), camera_commands.source("synthetic/studio", "", tmp_path):
         pass
 
 
@@ -351,7 +351,7 @@ def test_a_realsense_brings_both_images_and_says_how_it_is_built(played):
 
 
 def test_a_realsense_is_recorded_and_opened_again(played, tmp_path):
-    commands.record(f"camera/realsense?file={played}", tmp_path / "a", 0.0)
+    camera_commands.record(f"camera/realsense?file={played}", tmp_path / "a", 0.0)
     again = open_sequence(tmp_path / "a")
     assert len(again) >= 8
     assert again.rig.name == "Soft D435"

@@ -58,6 +58,7 @@ LAYERS = (
     ("bench",),
     ("reports",),
     ("commands",),
+    ("camera_commands",),
     ("cli",),
     ("__main__",),
 )

@@ -26,7 +26,8 @@ from .driven import Abandoned, SlamFactory, make_slam, out_of_memory
 from .feed import Feed, FeedSubscription
 from .files import beside
 from .memory import keep_no_holes
-from .run import Plan, Run
+from .plan import Plan
+from .run import Run
 from .runfolder import RunFolder
 from .snapshots import state_of, take_snapshot
 from .supply import frames_of

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from time import monotonic
 from typing import Any
 
@@ -13,23 +12,22 @@ from numpy.typing import NDArray
 
 from .. import config_files
 from ..config import Config
-from ..datasets import Live
 from ..datasets.check import lacking_depth, odd_depth
 from ..datasets.views import in_order, problems
 from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
 from ..messages import MOVING, Event, LoopEvent, Notice, StepReport
 from ..rigid import rotation_angle_deg
-from ..types import Frame, FrameError, InputError, Sequence
+from ..types import Frame, FrameError, InputError
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
 from .continued import camera_of, require_same_camera, require_same_times
-from .control import ENDLESS
 from .driven import Abandoned, SlamFactory, SlamLike, import_slam
 from .driven import State as Arrays
 from .memory import return_holes
 from .meshjobs import MESH_POINTS, FrozenMap
 from .pictures import jpeg, shrink
+from .plan import Plan
 from .runfolder import RunFolder, read_about
 from .summary import summarise
 from .tally import Every, Stopwatch, Tally
@@ -42,29 +40,6 @@ MOST_WARNINGS = 100
 EACH_SKIP, MANY_SKIPS = 20, 100  # skipped frames that are told one by one, and then every how many
 HOLD_STILL = "the camera is on: hold it still until the first map appears, a second or two"
 GOOD_NEWS = ("relocalised", "recovered", MOVING)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What a run is to do. address: what ``open_sequence`` takes; frames: the ``A:B:STEP`` asked for, "" = all."""
-
-    config: Config
-    sequence: Sequence
-    address: str
-    frames: str
-    device: str
-    out: Path
-
-    @property
-    def live(self) -> Live | None:
-        """The sequence, while its camera is on, or where that has brought nothing."""
-        s = self.sequence
-        return s if isinstance(s, Live) and not (s.over() and len(s)) else None
-
-    @property
-    def total(self) -> int:
-        """How many frames there are to do; no end of them while a camera is on."""
-        return len(self.sequence) if self.live is None else ENDLESS
 
 
 class Run:
