@@ -151,7 +151,8 @@ def test_a_full_disk_ends_the_recording_and_says_where(tmp_path, monkeypatch):
         return whole(path, data)
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    camera = FakeCamera([shot(i % 12, i / 30) for i in range(500)], wait=True)
+    one = shot(0)
+    camera = FakeCamera([one._replace(seconds=i / 30) for i in range(500)], wait=True)
     with closing(LiveRecording(camera, tmp_path / "a")) as live:
         camera.go.release(3)
         deadline = time.monotonic() + 10
@@ -276,7 +277,8 @@ def test_a_camera_is_recorded_by_one_command(tmp_path, on_offer, monkeypatch, ca
 
 
 def test_recording_ends_when_its_time_is_over(tmp_path, monkeypatch):
-    camera = FakeCamera([shot(0, i / 30) for i in range(1000)], wait=True)
+    one = shot(0)
+    camera = FakeCamera([one._replace(seconds=i / 30) for i in range(1000)], wait=True)
     threading.Thread(target=lambda: [time.sleep(0.02) or camera.go.release() for _ in range(100)], daemon=True).start()
     monkeypatch.setattr(camera_commands, "open_camera", lambda address: camera)
     began = time.monotonic()
