@@ -221,6 +221,14 @@ def test_a_damaged_rig_is_told_in_one_line(tmp_path, change, says):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("left", ["0.1", "0.1666", "0.166667 0000"])
+def test_a_recording_that_was_cut_off_in_the_middle_of_a_line_opens_up_to_there(tmp_path, left):
+    recorded(tmp_path / "a", FakeCamera([shot(i) for i in range(3)]))
+    with open(tmp_path / "a/frames.txt", "a") as file:
+        file.write(left)
+    assert len(open_sequence(tmp_path / "a")) == 3
+
+
 def test_a_recording_without_its_times_is_refused(tmp_path):
     recorded(tmp_path / "a", FakeCamera([shot(0)]))
     (tmp_path / "a/frames.txt").unlink()

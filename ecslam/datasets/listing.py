@@ -14,10 +14,13 @@ from .reading import read_text
 DECIMAL_COMMA = re.compile(r"(?<!\S)-?\d+,\d+(?!\S)")
 
 
-def read_rows(path: Path, columns: int) -> list[list[str]]:
-    """The first ``columns`` fields of each line that is no comment. Raises InputError."""
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
+def read_rows(path: Path, columns: int, may_break_off: bool = False) -> list[list[str]]:
+    """The first ``columns`` fields of each line that is no comment. may_break_off: whether a last line without its end
+    is left out, as where a recorder was killed. Raises InputError."""
+    rows, lines = [], read_text(path).splitlines(keepends=True)
+    if may_break_off and lines and not lines[-1].endswith("\n"):
+        lines.pop()
+    for number, line in enumerate(lines, 1):
         written = line.split("#")[0]
         fields = written.replace(",", " ").split()
         if fields and len(fields) < columns:

@@ -111,7 +111,7 @@ def open(path: Path) -> Recording:
     rig = read_rig(path / FILE)
     if not (path / TIMES).is_file():
         raise InputError(f"{path / TIMES}: is missing, and with it the times of all frames; put it back")
-    rows = read_rows(path / TIMES, 2)
+    rows = read_rows(path / TIMES, 2, may_break_off=True)
     times = to_times([row[0] for row in rows], path / TIMES)
     color, depth = ([place(path, row[1]) for row in rows] for place in (color_file, depth_file))
     seen, measured = present(path, color), present(path, depth)
