@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from ..atomic import write_named
 from ..strict_yaml import is_number, parse_yaml
 from ..types import InputError, Intrinsics
+from .calibration import PINHOLE, SIZE
 from .files import FileSequence
 from .listing import read_rows, to_times
 from .reading import common_size, read_text, rigid
 from .registration import Registration
-from .tum import ground_truth, notes_on_missing, present
+from .tum import ground_truth, with_both
 
 FILE, TIMES = "recording.yaml", "frames.txt"
-PINHOLE, SIZE = ("fx", "fy", "cx", "cy"), ("width", "height")
 ABOUT = """\
 # What recorded the images in rgb/ and depth/, whose times are in frames.txt. depth_scale: units of depth a metre;
 # depth, color: the cameras, in pixels, distortion as OpenCV has it (k1 k2 p1 p2 k3); depth_to_color: takes points in
@@ -114,8 +114,7 @@ def open(path: Path) -> Recording:
     rows = read_rows(path / TIMES, 2, may_break_off=True)
     times = to_times([row[0] for row in rows], path / TIMES)
     color, depth = ([place(path, row[1]) for row in rows] for place in (color_file, depth_file))
-    seen, measured = present(path, color), present(path, depth)
-    kept = np.intersect1d(seen, measured)
+    kept, notes = with_both(path, color, depth)
     for files, camera in ((color, rig.color), (depth, rig.depth)):
         width, height = common_size([files[i] for i in kept])
         if (width, height) != (camera.width, camera.height):
@@ -123,7 +122,6 @@ def open(path: Path) -> Recording:
             raise InputError(
                 f"{path}: images such as {files[0].name} are {width}x{height}, but {told}; put back its own"
             )
-    notes = notes_on_missing([*color, *depth], len(seen) + len(measured))
     poses, pose_notes = ground_truth(path, None, times[kept])
     return Recording(path, rig, [rows[i][1] for i in kept], times[kept], poses, (*notes, *pose_notes))
 

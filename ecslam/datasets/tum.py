@@ -138,7 +138,7 @@ def _from_lists(path: Path) -> Images:
     """Of each list what is there, joined by time."""
     color_times, color_files = _read_list(path / "rgb.txt")
     depth_times, depth_files = _read_list(path / "depth.txt")
-    color, depth = present(path, color_files), present(path, depth_files)
+    color, depth = _present(path, color_files), _present(path, depth_files)
     pairs = associate(color_times[color], depth_times[depth], MAX_DIFFERENCE_S)
     if len(pairs) == 0:
         raise InputError(
@@ -146,7 +146,7 @@ def _from_lists(path: Path) -> Images:
             "on one clock?"
         )
     alone = len(color) - len(pairs), len(depth) - len(pairs)
-    notes = notes_on_missing([*color_files, *depth_files], len(color) + len(depth))
+    notes = _notes_on_missing([*color_files, *depth_files], len(color) + len(depth))
     if any(alone):
         notes = (*notes, f"{alone[0]} colour and {alone[1]} depth images have no partner within 20 ms and are left out")
     i, j = color[pairs[:, 0]], depth[pairs[:, 1]]
@@ -161,9 +161,7 @@ def _from_associations(path: Path) -> Images:
     places = {"color": (2, 3), "depth": (0, 1)} if depth_first else {"color": (0, 1), "depth": (2, 3)}
     times = to_times([row[places["depth"][0]] for row in rows], file)
     color, depth = ([listed_file(path, row[places[what][1]]) for row in rows] for what in ("color", "depth"))
-    seen, measured = present(path, color), present(path, depth)
-    both = np.intersect1d(seen, measured)
-    notes = notes_on_missing([*color, *depth], len(seen) + len(measured))
+    both, notes = with_both(path, color, depth)
     return Images(times[both], [color[k] for k in both], [depth[k] for k in both], notes)
 
 
@@ -179,7 +177,14 @@ def _by_time(images: Images) -> Images:
     return Images(images.times[order], color, depth, (*images.notes, note))
 
 
-def present(folder: Path, files: list[Path]) -> NDArray[np.int64]:
+def with_both(folder: Path, color: list[Path], depth: list[Path]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """The indices of listed pairs of images that are both there, and a note where some are not. Raises InputError when
+    too many are not."""
+    seen, measured = _present(folder, color), _present(folder, depth)
+    return np.intersect1d(seen, measured), _notes_on_missing([*color, *depth], len(seen) + len(measured))
+
+
+def _present(folder: Path, files: list[Path]) -> NDArray[np.int64]:
     """The indices of those that exist. Raises InputError when too many do not."""
     there = np.array([file.is_file() for file in files])
     if (~there).sum() > MOST_MISSING * len(files):
@@ -190,8 +195,7 @@ def present(folder: Path, files: list[Path]) -> NDArray[np.int64]:
     return np.flatnonzero(there)
 
 
-def notes_on_missing(files: list[Path], there: int) -> tuple[str, ...]:
-    """A note where ``there`` of the listed images are not all."""
+def _notes_on_missing(files: list[Path], there: int) -> tuple[str, ...]:
     if there == len(files):
         return ()
     first = next(file for file in files if not file.is_file())

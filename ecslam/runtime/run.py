@@ -200,11 +200,11 @@ class Run:
 
     def warm_up(self) -> None:
         """Load what takes seconds before there is a frame, so that a camera's first one does not grow old meanwhile."""
-        if self.live is not None or self.config.realtime:
-            import_slam()
         if self.live is not None and self.slam is None:
             self._build(None, None)
             self.notice("info", HOLD_STILL)
+        elif self.config.realtime:
+            import_slam()
 
     def end_live(self) -> None:
         """Switch the camera off, where there is one, and tell what went wrong with it."""
