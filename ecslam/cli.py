@@ -53,7 +53,10 @@ Settings = Annotated[
 Frames = Annotated[str, typer.Option(metavar="A:B:STEP", help="Which frames, as a Python slice; default: all.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Random seed; default: the configuration's (0).")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ... or auto: a CUDA GPU where there is one.")]
-Schedule = Annotated[str | None, typer.Option(help="strict (deterministic on a CPU) or overlap (two threads).")]
+Schedule = Annotated[
+    str | None,
+    typer.Option(help="strict (deterministic on a CPU), overlap (maps while it tracks) or auto (overlap on a GPU)."),
+]
 Realtime = Annotated[
     bool, typer.Option("--realtime", help="As from a camera: no faster than recorded, frames are left out to keep up.")
 ]

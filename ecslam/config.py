@@ -161,6 +161,7 @@ class WindowConfig:
 class Config:
     """Everything a run depends on besides the sequence. Defaults are the paper's lite preset on Replica.
 
+    schedule: ``strict`` maps between frames, ``overlap`` beside tracking, ``auto`` does that on a GPU alone.
     denoise: smooth depth by as much as it is noisy (ours). deskew: take out the motion during a rolling shutter (ours,
     see ``shutter``). exposure: bring luminance to what the first frame's exposure would give (ours, see ``exposure``).
     movers: whether what moves by itself is left in (ours, see ``movers``). realtime: play a recording no faster than it
@@ -170,7 +171,7 @@ class Config:
 
     preset: str = "lite"
     seed: int = _number(0, 0, 2**31 - 1)
-    schedule: Literal["strict", "overlap"] = "strict"
+    schedule: Literal["auto", "strict", "overlap"] = "auto"
     realtime: bool = False
     fus: bool = True
     eba: bool = True

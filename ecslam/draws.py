@@ -18,9 +18,11 @@ from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .rays import gather, make_rays, upload
 from .samples import LEAST_UNIFORM, rendered_depths, resampled, thinned, uniform
+from .sending import Letter
 
 Draw = Callable[[int, Tensor], RayBatch]
 AHEAD = 10
+A_POSE = 24  # numbers: see ``DeviceViews``
 
 
 def shares(views: int, rays: int, newest_share: float) -> list[int]:
@@ -86,23 +88,80 @@ class HostDraw:
 
 @dataclass(frozen=True)
 class DeviceViews:
-    """What the rays of a loop are drawn from, on one device.
+    """What the rays of a loop are drawn from, and from where these views were seen, on one device.
 
-    spans: int64 [W, 2], first row and count of each view in ``pixels``. row: int64 [R], the view of each ray. box: [2,
-    3] metres. missing: whether some pixels have no depth.
+    numbers: float64 [24 P]: of P poses c2w [4, 4] each, then their learning rates [6] each, then the first row and the
+    count of each view in ``pixels``. row: int64 [R], the view of each ray. box: [2, 3] metres. missing: whether some
+    pixels have no depth.
     """
 
     pixels: DevicePixels
-    spans: Tensor
+    numbers: Tensor
     row: Tensor
     box: Tensor
     missing: bool
 
-    def numbers(self, config: Config) -> int:
+    @property
+    def poses(self) -> int:
+        """How many there is room for."""
+        return len(self.numbers) // A_POSE
+
+    @property
+    def c2w(self) -> Tensor:
+        """[P, 4, 4]."""
+        return self.numbers[: 16 * self.poses].view(-1, 4, 4)
+
+    @property
+    def rates(self) -> Tensor:
+        """[P, 6]."""
+        return self.numbers[16 * self.poses : 22 * self.poses].view(-1, 6)
+
+    @property
+    def spans(self) -> Tensor:
+        """int64 [P, 2]."""
+        return self.numbers[22 * self.poses :].view(-1, 2).long()
+
+    def jitter(self, config: Config) -> int:
         """How many random numbers a ray takes: which pixel, where its samples lie and, with ``missing``, where those
         lie that follow the rendered depth."""
         s = config.sampling
         return 1 + s.uniform + (2 if self.missing else 1) * s.near_depth
+
+
+class Desk:
+    """Where all that a mapping's loops are given lies on a device: always in the same places and of the same sizes, so
+    that graphs can be replayed. poses: room for so many. rays: of an iteration."""
+
+    def __init__(self, poses: int, rays: int, device: torch.device) -> None:
+        self.poses, self.rays = poses, rays
+        self._letter = Letter(A_POSE * poses, device)
+        self._row, self._counts = torch.zeros(rays, dtype=torch.int64, device=device), [0]
+        self._jitter: dict[tuple[int, int], Tensor] = {}
+
+    def lay_out(
+        self,
+        bank: PixelBank,
+        views: Sequence[Pixels],
+        c2w: NDArray[np.float64],
+        rates: NDArray[np.float64],
+        newest_share: float,
+        box: Tensor,
+    ) -> DeviceViews:
+        """Views with their poses c2w [W, 4, 4] and learning rates [W, 6], never waiting. box: on the device."""
+        places, empty = bank.places(views), self.poses - len(views)
+        spans = [(place.first, len(place.view)) for place in places]
+        rest = np.tile(np.eye(4), (empty, 1, 1)), np.zeros((empty, 6)), np.zeros((empty, 2))
+        numbers = self._letter.send(c2w, rest[0], rates, rest[1], spans, rest[2])
+        if (counts := shares(len(views), self.rays, newest_share)) != self._counts:
+            row = np.repeat(np.arange(len(views)), counts)
+            self._row.copy_(torch.from_numpy(row[evenly(len(row), self.rays)]), non_blocking=True)
+            self._counts = counts
+        return DeviceViews(bank.columns, numbers, self._row, box, any(place.missing for place in places))
+
+    def jitter(self, iterations: int, count: int, generator: torch.Generator | None) -> Tensor:
+        """Random numbers in 0..1 [iterations, R, count], where the last ones of that size were."""
+        kept = self._jitter.setdefault((iterations, count), self._row.new_empty(0, dtype=torch.float32))
+        return torch.rand(iterations, self.rays, count, generator=generator, out=kept)
 
 
 class DeviceDraw:
@@ -135,31 +194,3 @@ class DeviceDraw:
         few = replace(rays, z=self._thinned[part])
         z = rendered_depths(few, c2w, self._field, self._kernels, self._jitter[part])
         return replace(rays, z=torch.where(self._has[part], rays.z, z))
-
-
-def device_views(
-    bank: PixelBank,
-    views: Sequence[Pixels],
-    poses: int,
-    config: Config,
-    box: Tensor,
-    device: torch.device,
-) -> DeviceViews:
-    """What to draw from these views. Sizes are always the same, so that a graph can be replayed: exactly ``rays`` rays,
-    and room for so many ``poses``."""
-    m, places = config.mapping, bank.places(views)
-    spans = np.zeros((poses, 2), np.int64)
-    spans[: len(views)] = [(place.first, len(place.view)) for place in places]
-    row = np.repeat(np.arange(len(views)), shares(len(views), m.rays, m.newest_share))
-    return DeviceViews(
-        bank.columns,
-        torch.from_numpy(spans).to(device, non_blocking=True),
-        torch.from_numpy(row[evenly(len(row), m.rays)]).to(device, non_blocking=True),
-        box.to(device, non_blocking=True),
-        any(place.missing for place in places),
-    )
-
-
-def padded(c2w: NDArray[np.float64], poses: int) -> NDArray[np.float64]:
-    """The poses [W, 4, 4] with identities behind them: [poses, 4, 4]."""
-    return np.concatenate([c2w, np.tile(np.eye(4), (poses - len(c2w), 1, 1))])

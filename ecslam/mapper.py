@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -12,17 +12,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .config import Config
-from .draws import DeviceDraw, DeviceViews, Draw, HostDraw, device_views, padded
+from .draws import Desk, DeviceDraw, DeviceViews, Draw, HostDraw
 from .field import TsdfField, grow_field, map_params, regrow
 from .field_adam import FieldAdam
-from .kernels import LOSS_NAMES, Backend, DevicePixels, FieldParams, Weights
+from .kernels import LOSS_NAMES, Backend, FieldParams, Weights
 from .kernels.graphs import Recorder
 from .pixel_bank import PixelBank
 from .pixels import Pixels
 from .pose_adam import PoseAdam, pose_rates
 from .rays import kernel_weights
-from .samples import seeded, smooth_lattice, uniform
+from .samples import seeded, smooth_lattice
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
+from .since import Since
 
 MIN_BETA = 1.0
 CHUNK = 10  # iterations in a CUDA graph where no pose moves
@@ -31,12 +32,36 @@ CHUNK = 10  # iterations in a CUDA graph where no pose moves
 @dataclass(frozen=True)
 class MapResult:
     """c2w: float64 [W, 4, 4] refined poses of the views. losses: weighted terms of the last iteration; loss_first: the
-    objective of the first one. failed: NaN or infinity came up, so map and poses are as they were before."""
+    objective of the first one. took_s: seconds. failed: NaN or infinity came up, so map and poses are as before."""
 
     c2w: NDArray[np.float64]
     losses: dict[str, float]
     loss_first: float
+    took_s: float
     failed: bool = False
+
+
+class Mapping:
+    """A mapping that has begun, see ``Mapper.begin``; on a GPU its result arrives by itself."""
+
+    def __init__(self, c2w: NDArray[np.float64], told: Tensor, since: Since, undo: Callable[[], None]) -> None:
+        """told: float64 [16 W + 11], the poses [W, 4, 4], the loss terms of the first and the last iteration [5] each,
+        and whether all is finite."""
+        self._c2w, self._since, self._undo, self._told = c2w, since, undo, since.bring(told)
+
+    def done(self) -> bool:
+        """Whether ``result`` need not wait."""
+        return self._since.done()
+
+    def result(self) -> MapResult:
+        """What came of it; waits for it."""
+        took_s, told = self._since.seconds(), self._told
+        if not told[-1]:
+            self._undo()
+            return MapResult(self._c2w, {}, float("nan"), took_s, failed=True)
+        first, last = told[self._c2w.size : -1].float().view(2, -1)
+        poses = told[: self._c2w.size].view(self._c2w.shape).numpy()
+        return MapResult(poses, dict(zip(LOSS_NAMES, last.tolist(), strict=True)), float(first.sum()), took_s)
 
 
 def _tensors(params: FieldParams) -> list[Tensor]:
@@ -82,6 +107,7 @@ class Mapper:
         self._gradients = map_params(field.params, torch.zeros_like)
         self._optimiser = FieldAdam(_tensors(field.params))
         self._bank, self._spare = PixelBank(field.device), [torch.zeros(0)]
+        self._desk, self._box = Desk(0, 0, field.device), field.layout.box.to(field.device)
 
     def run(
         self,
@@ -99,23 +125,33 @@ class Mapper:
         Every iteration draws its rays from the stored pixels and transforms them by the current poses. smooth: with the
         smoothness term. settle: the map's learning rates fade to none, as those of the poses always do.
         """
-        before = self._backup()
+        return self.begin(views, c2w, fixed, iterations, config, interrupt, smooth, settle).result()
+
+    def begin(
+        self,
+        views: Sequence[Pixels],
+        c2w: NDArray[np.float64],
+        fixed: NDArray[np.bool_],
+        iterations: int,
+        config: Config,
+        interrupt: Callable[[], None] | None = None,
+        smooth: bool = False,
+        settle: bool = False,
+    ) -> Mapping:
+        """``run``, which on a GPU is only on its way when this returns. One at a time. Where it comes to nothing, all
+        is put back when its result is asked for."""
+        since, before = Since(self.field.device), self._backup()
         job = Job(config, bool(not fixed.all()), smooth, settle)
         interrupt = interrupt or (lambda: None)
         if self.field.device.type == "cpu":
             draw = HostDraw(views, config, self.field, self.kernels, self._rng, self._generator)
             left = [1 - i / iterations for i in range(iterations)]
             moved, losses = self._iterate(job, draw, torch.from_numpy(c2w), job.pose_rates(fixed), left, interrupt)
+            sound = self._sound(moved)
         else:
-            moved, losses = self._on_device(job, views, c2w, fixed, iterations, interrupt)
-        sound = torch.stack([*torch._foreach_norm(self._learnt()), moved.float().norm()]).isfinite().all()
-        told = torch.cat([moved.reshape(-1), losses[0].to(moved), losses[-1].to(moved), sound[None].to(moved)]).cpu()
-        if not told[-1]:
-            torch._foreach_copy_(self._learnt(), before)
-            return MapResult(c2w, {}, float("nan"), failed=True)
-        first, last = told[c2w.size : -1].float().view(2, -1)
-        poses = told[: c2w.size].view(c2w.shape).numpy()
-        return MapResult(poses, dict(zip(LOSS_NAMES, last.tolist(), strict=True)), float(first.sum()))
+            moved, losses, sound = self._on_device(job, views, c2w, fixed, iterations, interrupt)
+        told = torch.cat([moved.reshape(-1), losses[0].to(moved), losses[-1].to(moved), sound.to(moved)])
+        return Mapping(c2w, told, since, lambda: torch._foreach_copy_(self._learnt(), before))
 
     def _on_device(
         self,
@@ -125,47 +161,38 @@ class Mapper:
         fixed: NDArray[np.bool_],
         iterations: int,
         interrupt: Callable[[], None],
-    ) -> tuple[Tensor, Tensor]:
-        """The poses [W, 4, 4] and the loss terms [I, 5] of iterations, ``CHUNK`` (with moving poses all) in a graph;
-        ``interrupt`` is called between graphs."""
-        device, count = self.field.device, max(len(views), job.config.window.size)
-        generator = seeded(self._rng, device)
-        still = np.arange(count) >= len(views)
-        still[: len(views)] |= fixed
-        given = torch.from_numpy(padded(c2w, count)), job.pose_rates(still), 1 - torch.arange(iterations) / iterations
-        poses, rates, left = (t.to(device, non_blocking=True) for t in given)
-        chosen, losses = device_views(self._bank, views, count, job.config, self.field.layout.box, device), []
-        recorder = Recorder(plain=True) if job.smooth else self.recorder
-        for part_left in left.split(max(iterations, 1) if job.move else CHUNK):
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The poses [W, 4, 4], the loss terms [I, 5] of iterations, ``CHUNK`` (with moving poses all) in a graph, and
+        whether all is finite [1]; ``interrupt`` is called between graphs."""
+        config, m, device, losses = job.config, job.config.mapping, self.field.device, []
+        room = max(len(views), config.window.size)
+        if (self._desk.poses, self._desk.rays) != (room, m.rays):
+            self._desk = Desk(room, m.rays, device)
+        rates = job.pose_rates(fixed).numpy()
+        chosen = self._desk.lay_out(self._bank, views, c2w, rates, m.newest_share, self._box)
+        generator, recorder = seeded(self._rng, device), Recorder(plain=True) if job.smooth else self.recorder
+        for left in _fading(iterations, device).split(max(iterations, 1) if job.move else CHUNK):
             interrupt()
-            jitter = uniform(generator, device, len(part_left), len(chosen.row), chosen.numbers(job.config))
-            inputs = (poses, rates, part_left, chosen.spans, chosen.row, chosen.box, jitter)
-            poses, found = recorder(
-                partial(self._loop, job, chosen.pixels, chosen.missing),
-                *inputs,
-                key=(job, chosen.missing),
-                over=(self.field, self._optimiser, chosen.pixels),
+            jitter = self._desk.jitter(len(left), chosen.jitter(config), generator)
+            poses, found, sound = recorder(
+                partial(self._loop, job, chosen, jitter),
+                left,
+                key=(job.move, job.smooth, job.settle, chosen.missing),
+                over=(self.field, self._optimiser, config, chosen.pixels, chosen.numbers, chosen.row, jitter),
+                lent=True,
             )
-            losses.append(found)
-        return poses[: len(views)], torch.cat(losses)
+            losses.append(found.clone())
+        return poses[: len(views)], torch.cat(losses), sound
 
-    def _loop(
-        self,
-        job: Job,
-        pixels: DevicePixels,
-        missing: bool,
-        c2w: Tensor,
-        rates: Tensor,
-        left: Tensor,
-        spans: Tensor,
-        row: Tensor,
-        box: Tensor,
-        jitter: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Iterations as a function of tensors. left: [I]; jitter: [I, R, numbers]; the rest: see ``DeviceViews``."""
-        views = DeviceViews(pixels, spans, row, box, missing)
-        draw = DeviceDraw(views, jitter, c2w, job.config, self.field, self.kernels)
-        return self._iterate(job, draw, c2w, rates, left.unbind(), lambda: None)
+    def _loop(self, job: Job, views: DeviceViews, jitter: Tensor, left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Iterations as a function of tensors. left: [I]; jitter: [I, R, numbers]."""
+        draw = DeviceDraw(views, jitter, views.c2w, job.config, self.field, self.kernels)
+        poses, losses = self._iterate(job, draw, views.c2w, views.rates, left.unbind(), lambda: None)
+        return poses, losses, self._sound(poses)
+
+    def _sound(self, poses: Tensor) -> Tensor:
+        """Whether all that was learnt is finite, bool [1]."""
+        return torch.stack([*torch._foreach_norm(self._learnt()), poses.float().norm()]).isfinite().all()[None]
 
     def _iterate(
         self,
@@ -237,9 +264,11 @@ class Mapper:
         return self
 
     def grow(self, box: NDArray[np.float64]) -> None:
-        """Extend the field to the union of its box and ``box`` [2, 3]; values inside and the Adam state are kept."""
+        """Extend the field to the union of its box and ``box`` [2, 3]; values inside and the Adam state are kept. Looks
+        at no point of it, so that the kernels know the new layout before a graph is recorded that uses it."""
         old = self.field
         self.field = grow_field(old, box)
+        self._box = self.field.layout.box.to(old.device)
         self._gradients = map_params(self.field.params, torch.zeros_like)
         table = self.field.params.table
 
@@ -247,3 +276,10 @@ class Mapper:
             return regrow(old.layout, self.field.layout, moment) if parameter is table else moment
 
         self._optimiser = self._optimiser.moved(_tensors(self.field.params), change)
+        self.kernels.values(self.field.layout, self.field.params, table.new_empty(0, 3))
+
+
+@cache
+def _fading(iterations: int, device: torch.device) -> Tensor:
+    """The share of the iterations that remains at each of them [I]."""
+    return (1 - torch.arange(iterations) / iterations).to(device, non_blocking=True)

@@ -65,7 +65,8 @@ class StepReport:
     losses: weighted terms of the last optimisation (``free_space``, ``centre``, ``tail``, ``depth``, ``colour``); where
     direct alignment alone tracks ``align_mm``: the root of its robust cost per point, luminance included, millimetres.
     window: frame indices of the keyframes in the bundle adjustment that was applied with this frame (else empty).
-    map_ms: what that took, in the schedule ``overlap`` beside tracking.
+    map_ms: what that took, in the schedule ``overlap`` beside tracking. step_ms: what the frame took in all, so less
+    than both where mapping went on beside tracking.
     c2w: float64 [4, 4] estimate for this frame after all corrections. tracked: False where it is that of the frame
     before, since none was to be trusted.
     """
@@ -80,6 +81,7 @@ class StepReport:
     losses: dict[str, float]
     track_ms: float
     map_ms: float
+    step_ms: float
     loop: LoopEvent | None = None
     note: str = ""
 

@@ -1,7 +1,8 @@
 """EC-SLAM on one screen: ``Slam.step`` takes a frame through the whole method.
 
 Synchronous at heart. In the ``strict`` schedule mapping runs inline (deterministic on a CPU); in ``overlap`` the same
-function runs on a second thread, as in the paper, and its result is applied between frames.
+function runs beside tracking, as in the paper, on a second thread or in a second stream of a GPU, and its result is
+applied between frames.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -27,7 +27,7 @@ from .kernels.denormals import flushed
 from .kernels.graphs import Recorder
 from .keyframes import Keyframe, Shelf, make_keyframe, surface_points
 from .loops import LoopDetector, loop_event
-from .mapper import Mapper, MapResult
+from .mapper import Mapper, Mapping, MapResult
 from .messages import MOVING, LoopEvent, StepReport
 from .rigid import is_rigid
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
@@ -45,11 +45,18 @@ SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
 
 @dataclass(frozen=True)
 class Mapped:
-    """A mapping that is done. window: rows [W] of the keyframes that took part. took_s: seconds."""
+    """A mapping that is done. window: rows [W] of the keyframes that took part."""
 
     window: NDArray[np.int64]
     result: MapResult
-    took_s: float
+
+
+@dataclass(frozen=True)
+class Pending:
+    """A mapping that goes on beside tracking; see ``Mapped``."""
+
+    window: NDArray[np.int64]
+    coming: Future[MapResult] | Mapping
 
 
 @dataclass(frozen=True)
@@ -93,9 +100,11 @@ class Slam:
             config, intrinsics, self.device, self.kernels_name, self._kernels, self._rng, self._generator
         )
         self._loops = LoopDetector()
-        self._pool = ThreadPoolExecutor(1, "mapper") if config.schedule == "overlap" else None
-        self._pending: Future[Mapped] | None = None
-        self._stream = torch.cuda.Stream(self.device) if self._pool and self.device.type == "cuda" else None
+        on_gpu = self.device.type == "cuda"
+        self._beside = config.schedule == "overlap" or (config.schedule == "auto" and on_gpu)
+        self._pool = ThreadPoolExecutor(1, "mapper") if self._beside and not on_gpu else None
+        self._stream = torch.cuda.Stream(self.device) if self._beside and on_gpu else None
+        self._pending: Pending | None = None
         self._landed = Landed()
         self._frozen: TsdfField | None = None
         self._note, self._graphs_failed, self._moving = "", False, False
@@ -135,6 +144,7 @@ class Slam:
             waited_s = self._apply_pending(block=True)
             loop = self._map(frame.index, interrupt)
         landed, self._landed = self._landed, Landed()
+        now = time.perf_counter()
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,
@@ -145,7 +155,8 @@ class Slam:
             window=landed.window,
             losses=track.losses if landed.losses is None else landed.losses,
             track_ms=1e3 * (tracked - started),
-            map_ms=1e3 * (time.perf_counter() - tracked - waited_s + landed.beside_s),
+            map_ms=1e3 * (now - tracked - waited_s + landed.beside_s),
+            step_ms=1e3 * (now - started),
             loop=loop,
             note=recovery.note or self._take_note(),
         )
@@ -174,6 +185,7 @@ class Slam:
         self._landed = Landed()
         self._follower.fuse(frame, self.trajectory[-1], STILL, self.config)
         self._follower.remember(frame, 0)
+        took_ms = 1e3 * (time.perf_counter() - started)
         return StepReport(
             frame=frame.index,
             timestamp=frame.timestamp,
@@ -184,7 +196,8 @@ class Slam:
             window=(frame.index,),
             losses=mapped.result.losses,
             track_ms=0.0,
-            map_ms=1e3 * (time.perf_counter() - started),
+            map_ms=took_ms,
+            step_ms=took_ms,
         )
 
     @flushed()
@@ -195,7 +208,7 @@ class Slam:
         self._apply_pending(block=True)
         if self._pool is not None:
             self._pool.shutdown()
-            self._pool = None
+        self._beside, self._pool, self._stream = False, None, None
         if self.mapper is not None and not self._follower.recovery.lost:
             self._apply(self._optimise(self._choose_window(), self.config.mapping.iterations, interrupt, smooth=True))
             self._settle(interrupt)
@@ -212,15 +225,13 @@ class Slam:
     # ---- mapping ----------------------------------------------------------------------------------------------------
 
     def _map(self, frame: int, interrupt: Interrupt | None) -> LoopEvent | None:
-        """Window, joint optimisation, and an event when old keyframes come back. In ``overlap`` the optimisation runs
-        on while tracking goes on, except when a loop closes."""
+        """Window, joint optimisation, and an event when old keyframes come back. In ``overlap`` the optimisation goes
+        on while tracking does, except when a loop closes."""
         self._check_box()
         window, iterations = self._choose_window(), self.config.mapping.iterations
         old = self._loops.update(self.trajectory.keyframe_poses(), self.trajectory[-1])
-        if self._pool is not None and len(old) == 0:
-            if self._stream is not None:
-                self._stream.wait_stream(torch.cuda.current_stream(self.device))
-            self._pending = self._pool.submit(self._beside, window, iterations)
+        if self._beside and len(old) == 0:
+            self._pending = Pending(window, self._begin_beside(window, iterations))
             return None
         before = self.trajectory.poses() if len(old) else None
         mapped = self._optimise(window, iterations, interrupt)
@@ -254,17 +265,23 @@ class Slam:
     def _optimise(
         self, window: NDArray[np.int64], iterations: int, interrupt: Interrupt | None, smooth: bool = False
     ) -> Mapped:
+        return Mapped(window, self._begin(window, iterations, interrupt, smooth).result())
+
+    def _begin(
+        self, window: NDArray[np.int64], iterations: int, interrupt: Interrupt | None = None, smooth: bool = False
+    ) -> Mapping:
         assert self.mapper is not None
-        began = time.perf_counter()
         views = [self.keyframes[i].pixels for i in window]
         poses = self.trajectory.keyframe_poses()[window]
-        result = self.mapper.run(views, poses, window == 0, iterations, self.config, interrupt, smooth)
-        return Mapped(window, result, time.perf_counter() - began)
+        return self.mapper.begin(views, poses, window == 0, iterations, self.config, interrupt, smooth)
 
-    def _beside(self, window: NDArray[np.int64], iterations: int) -> Mapped:
-        """What the second thread does; on a GPU in a stream of its own, or tracking would queue up behind it."""
-        with torch.cuda.stream(self._stream) if self._stream is not None else nullcontext():
-            return self._optimise(window, iterations, None)
+    def _begin_beside(self, window: NDArray[np.int64], iterations: int) -> Future[MapResult] | Mapping:
+        if self._pool is not None:
+            return self._pool.submit(lambda: self._begin(window, iterations).result())
+        assert self._stream is not None
+        self._stream.wait_stream(torch.cuda.current_stream(self.device))
+        with torch.cuda.stream(self._stream):
+            return self._begin(window, iterations)
 
     def _apply(self, mapped: Mapped, beside_s: float = 0.0) -> None:
         window, result = mapped.window, mapped.result
@@ -278,21 +295,18 @@ class Slam:
         self._frozen = self._tracking_field()
 
     def _apply_pending(self, block: bool) -> float:
-        """Apply what the second thread has made; the seconds that were waited for it."""
-        if self._pending is None or not (block or self._pending.done()):
+        """Apply what was made beside tracking; the seconds that were waited for it."""
+        if self._pending is None or not (block or self._pending.coming.done()):
             return 0.0
-        began = time.perf_counter()
-        mapped, self._pending = self._pending.result(), None
+        began, pending, self._pending = time.perf_counter(), self._pending, None
+        result = pending.coming.result()
         waited_s = time.perf_counter() - began
-        if self._stream is not None:
-            # A mapping that diverged is undone after it last waited.
-            torch.cuda.current_stream(self.device).wait_stream(self._stream)
-        self._apply(mapped, mapped.took_s)
+        self._apply(Mapped(pending.window, result), result.took_s)
         return waited_s
 
     def _tracking_field(self) -> TsdfField:
         assert self.mapper is not None
-        return self.mapper.field if self._pool is None else self.mapper.field.freeze(self._frozen)
+        return self.mapper.field.freeze(self._frozen) if self._beside else self.mapper.field
 
     def _new_recorder(self) -> Recorder:
         return Recorder(plain=self.kernels_name != "gpu")

@@ -7,6 +7,7 @@ aligned to the fused volume, then the paper's rendered tracking, where the prese
 from __future__ import annotations
 
 from dataclasses import dataclass
+from dataclasses import field as own
 from functools import cache, partial
 
 import numpy as np
@@ -27,14 +28,16 @@ from .observed_gpu import ObservedTable
 from .pixels_gpu import DeviceFrame, choose, grid_cells, padded_corners, spread, straight, straight_pixels
 from .pose_adam import pose_rates
 from .rays import kernel_weights, make_rays
-from .samples import uniform
+from .sending import Dice, Letter
 from .shutter import STILL, Sweep
 from .tracker import LEAST_POINTS, LEAST_SEEN, SURELY, TrackResult, descend_rendered
 from .types import Frame, Intrinsics
 from .volume_gpu import GpuVolume
 
+HEAD = 24
 
-@dataclass(frozen=True)
+
+@dataclass
 class GpuTracker:
     """What tracking reads. volume: what frames are aligned to. observed: where the map may be trusted. generator: on
     the device, for pixels and samples."""
@@ -45,6 +48,8 @@ class GpuTracker:
     kernels: Backend
     generator: torch.Generator
     recorder: Recorder
+    _dice: Dice | None = own(default=None, init=False)
+    _letter: Letter | None = own(default=None, init=False)
 
     def track(
         self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep = STILL
@@ -53,45 +58,57 @@ class GpuTracker:
         device, shown = field.device, self.volume.show(frame)
         a, t, s = config.align, config.tracking, config.sampling
         points, rays = grid_cells(shown, a.points, config), t.rays if t.iterations else 0
-        numbers = uniform(self.generator, device, 2 * points + rays * (3 + s.uniform + s.near_depth))
-        corners = torch.from_numpy(padded_corners(frame, config, rays)).to(device, non_blocking=True)
-        start = torch.from_numpy(np.concatenate([guess.reshape(16), sweep, [frame.gain]])).to(device, non_blocking=True)
+        corners = padded_corners(frame, config, rays)
+        dice, letter = self._given(2 * points + rays * (3 + s.uniform + s.near_depth), HEAD + len(corners))
+        letter.send(guess, sweep, frame.gain, dice.throw(), corners)
         order = _shuffled(grid_cells(shown, rays, config) if rays else 0, device)
         rates = _rates(t.lr_rotation, t.lr_translation, device)
-        over = field, self.volume.blocks, config, shown, order, rates
-        (found,) = self.recorder(partial(self._whole, *over), corners, start, numbers, key=None, over=over)
-        pose, (cost, fit, usable), terms = np.split(found.cpu().numpy(), [12, TOLD])
+        over = field if rays else None, self.volume.blocks, config, shown, order, rates, letter.there, dice.rows
+        (found,) = self.recorder(partial(self._whole, *over), key=None, over=over, device=device, lent=True)
+        told = found.cpu().numpy()
+        pose, (cost, fit, usable), terms = told[:12], told[12:TOLD].tolist(), told[TOLD:]
         if usable < LEAST_POINTS:
             return TrackResult(guess, {}, 0.0)
         losses = dict(zip(LOSS_NAMES, terms.tolist(), strict=True)) if rays else {"align_mm": 1e3 * cost**0.5}
-        return TrackResult(np.concatenate([pose.reshape(3, 4), guess[3:]]), losses, float(fit))
+        return TrackResult(np.concatenate([pose.reshape(3, 4), guess[3:]]), losses, fit)
+
+    def _given(self, random: int, sent: int) -> tuple[Dice, Letter]:
+        """Dice for so many ``random`` numbers a frame, and a letter for those that are ``sent``: the last ones, since
+        graphs are recorded over these."""
+        if self._dice is None or self._dice.rows.shape[1] != random:
+            self._dice = Dice(random, self.generator)
+        if self._letter is None or len(self._letter.there) != sent:
+            self._letter = Letter(sent, self.generator.device)
+        return self._dice, self._letter
 
     def _whole(
         self,
-        field: TsdfField,
+        field: TsdfField | None,
         blocks: Blocks,
         config: Config,
         frame: DeviceFrame,
         order: Tensor,
         rates: Tensor,
-        corners: Tensor,
-        start: Tensor,
-        numbers: Tensor,
+        letter: Tensor,
+        rows: Tensor,
     ) -> tuple[Tensor]:
-        """Everything as a function of tensors: float64 [TOLD, and the loss terms where frames are rendered]. start:
-        float64 [23], the guess [4, 4], the sweep [6] and the gain of the frame."""
+        """Everything as a function of tensors: float64 [TOLD, and the loss terms where frames are rendered]. field:
+        None where they are not. letter: float64 [HEAD + C], the guess [4, 4], the sweep [6], the gain of the frame,
+        which of the ``rows`` of random numbers, and its corners [C]."""
         a, settings = config.align, tuple(stages(config))
         cells = grid_cells(frame, a.points, config)
-        points = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2), start[22:])
+        numbers = rows.index_select(0, letter[HEAD - 1 : HEAD].long())[0]
+        points = spread(frame, self.camera, a.points, config, numbers[: 2 * cells].view(cells, 2), letter[22:])
         rolling = self.camera.readout_s > 0 and config.deskew
-        guess, sweep = start[:16].view(4, 4), start[16:22]
+        guess, sweep = letter[:16].view(4, 4), letter[16:22]
         points = straight(points, self.camera, sweep) if rolling else points
         packed, first = tracking_gpu.packed(blocks, points, guess, LEAST_KNOWN)
         row = fusion_gpu.descend(blocks, packed, first, settings, a.iterations, COARSE_STRIDE, RULES)
-        pose, terms = row, start.new_empty(0)
-        if config.tracking.iterations:
+        pose, terms = row, letter.new_empty(0)
+        if field is not None:
             aligned, cost = fusion_gpu.unpack_pose(row)
             jitter = numbers[2 * cells :].view(config.tracking.rays, -1)
+            corners = letter[HEAD:].long()
             pixels = choose(frame, self.camera, config, corners, order, jitter[:, :3], self.observed, aligned)
             pixels = straight_pixels(pixels, self.camera, sweep) if rolling else pixels
             rendered, terms = self._rendered(field, config, pixels, aligned, rates, jitter[:, 3:])
@@ -107,8 +124,8 @@ class GpuTracker:
         t, row = config.tracking, torch.zeros_like(pixels.depth, dtype=torch.int64)
         rays = make_rays(pixels, row, c2w[None], c2w[:2, :3], self.kernels, config, jitter, missing=False)
         batch = (getattr(rays, name) for name in RayBatch.__dataclass_fields__)
-        weights = kernel_weights(t.loss, config)
-        best, terms = descend_rendered(field, self.kernels, weights, t.iterations, t.momentum, c2w[None], rates, *batch)
+        how = kernel_weights(t.loss, config), t.iterations, t.momentum
+        best, terms = descend_rendered(field, self.kernels, *how, c2w[None], rates, *batch)
         return best[0], terms
 
 

@@ -16,6 +16,7 @@ from .kernels.fusion import EDGE
 from .kernels.graphs import Recorder
 from .pixels import Points
 from .pixels_gpu import DeviceFrame
+from .sending import Letter
 from .shutter import STILL, Sweep
 from .types import Frame, Intrinsics
 from .volume import STRIDE
@@ -24,6 +25,7 @@ SLOTS = 1 << 16
 MOST_TAKEN = 0.5
 LEAST_POINTS = 2048
 COPIED = 4096  # blocks at a time
+NUMBERS = 26  # see ``fusion_gpu.View``
 
 
 class GpuVolume:
@@ -37,6 +39,7 @@ class GpuVolume:
         self._record = recorder or Recorder()
         self._now = 0
         self._shown: tuple[Frame, DeviceFrame] | None = None
+        self._letter = Letter(NUMBERS, device)
         self._taken = torch.zeros(2, dtype=torch.int32, pin_memory=device.type == "cuda")
         self._allocate(SLOTS)
 
@@ -62,17 +65,16 @@ class GpuVolume:
         self._grow_in_time()
         self._now += 1
         lens = camera.fx, camera.fy, camera.cx, camera.cy
-        numbers = [*c2w[:3].flat, *lens, near_m, far_m, self._now, *sweep, frame.gain]
+        letter = self._letter.send(c2w[:3], lens, (near_m, far_m, self._now), sweep, frame.gain)
         steps = int(np.ceil(2 * self.truncation_m / (0.5 * EDGE * self.voxel_m))) + 1
         blocks, listed, shown = self.blocks, self._listed, self.show(frame)
 
-        def whole(numbers: Tensor) -> tuple[Tensor]:
-            fusion_gpu.fuse(blocks, listed, shown.depth, shown.color, numbers, STRIDE, steps)
+        def whole() -> tuple[Tensor]:
+            fusion_gpu.fuse(blocks, listed, shown.depth, shown.color, letter, STRIDE, steps)
             return (listed.counts,)
 
-        given = self._upload(torch.tensor(numbers, dtype=torch.float64))
-        (counts,) = self._record(whole, given, key=steps, over=(blocks, shown))
-        self._taken.copy_(counts, non_blocking=True)
+        self._record(whole, key=steps, over=(blocks, shown), device=self._device, lent=True)
+        self._taken.copy_(listed.counts, non_blocking=True)
 
     def show(self, frame: Frame) -> DeviceFrame:
         """The frame's images on the device, until the next one's, which take their place."""

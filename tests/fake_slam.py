@@ -140,6 +140,7 @@ class FakeSlam:
             losses={"depth": 0.5, "colour": 0.25 * self.config.mapping.iterations},
             track_ms=2.0,
             map_ms=100.0 if first else 3.0,
+            step_ms=102.0 if first else 5.0,
             loop=loop,
             note="lost" if frame.index in b.lost else "",
         )

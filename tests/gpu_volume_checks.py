@@ -346,8 +346,9 @@ def test_a_replay_sees_the_newest_frame(pair):
     graphs, found = FakeGraphs(), []
     for recorder in (Recorder(plain=True), Recorder(capture=graphs.capture)):
         _, (tracker, field) = trackers(pair)
+        tracker.recorder = recorder
         for c2w in (TRUE, TRUE, pose((1, 4, -2), (0.03, 0.02, -0.01))):
-            track = replace(tracker, recorder=recorder).track(look(c2w, corner(), CAMERA), GUESS, field, TINY)
+            track = tracker.track(look(c2w, corner(), CAMERA), GUESS, field, TINY)
             found.append(track.c2w)
     np.testing.assert_allclose(found[3:], found[:3], atol=1e-4)
     assert np.abs(found[2] - found[1]).max() > 0.01
@@ -388,10 +389,14 @@ def test_tracking_waits_for_nothing(monkeypatch, pair, fus):
     blocks, _ = fusion_gpu.allocate(64, *LENGTHS, meta)
     shown = DeviceFrame(torch.zeros(36, 48, 3, dtype=torch.uint8, device=meta), torch.zeros(36, 48, device=meta))
     cells, order = grid_cells(shown, config.align.points, config), grid_cells(shown, config.tracking.rays, config)
-    numbers = torch.zeros(2 * cells + 60 * (3 + 7), device=meta)
-    corners, order = (torch.zeros(n, dtype=torch.int64, device=meta) for n in (20 if fus else 0, order))
-    start, rates = (torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((23,), (1, 6)))
-    given = field, blocks, config, shown, order, rates, corners, start, numbers
+    rows, order = (
+        torch.zeros(16, 2 * cells + 60 * (3 + 7), device=meta),
+        torch.zeros(order, dtype=torch.int64, device=meta),
+    )
+    letter, rates = (
+        torch.zeros(*shape, dtype=torch.float64, device=meta) for shape in ((HEAD + (20 if fus else 0),), (1, 6))
+    )
+    given = field, blocks, config, shown, order, rates, letter, rows
     tracker._whole(*given)  # uploads the layout, once
     with Forbidding():
         (found,) = tracker._whole(*given)

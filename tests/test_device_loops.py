@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from ecslam import kernels as seam
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
-from ecslam.draws import DeviceDraw, device_views, shares
+from ecslam.draws import Desk, DeviceDraw, DeviceViews, shares
 from ecslam.field import create_field
 from ecslam.kernels import FieldParams, RayBatch, StepResult, reference
 from ecslam.kernels.graphs import Recorder
@@ -24,7 +24,6 @@ from ecslam.pixels import Pixels, choose_pixels
 from ecslam.pose_adam import pose_rates
 from ecslam.rays import upload
 from ecslam.rigid import rotation_angle_deg
-from ecslam.samples import uniform
 from ecslam.tracker import descend_rendered, track_adam
 
 CPU = torch.device("cpu")
@@ -66,8 +65,9 @@ def test_a_map_drawn_on_the_device_is_as_good_as_one_drawn_by_numpy(room, config
     host, device = mapper(room, config), mapper(room, config)
     expected = host.run(views, poses, fixed, 60, config)
     job = Job(config, move=False, smooth=False, settle=False)
-    _, losses = device._on_device(job, views, poses, fixed, 60, lambda: None)
+    _, losses, sound = device._on_device(job, views, poses, fixed, 60, lambda: None)
     assert losses.shape == (60, 5)
+    assert sound.all()
     assert losses[0].sum() == pytest.approx(expected.loss_first, rel=0.15)
     assert losses[-5:].mean(0).sum() == pytest.approx(sum(expected.losses.values()), rel=0.25)
     assert losses[-1].sum() < 0.3 * losses[0].sum()
@@ -211,12 +211,12 @@ def test_no_iteration_of_a_mapping_waits_for_the_gpu(gpu, config, missing, settl
     job = Job(config, move=not settle, smooth=False, settle=settle)
     draws = on_gpu(4, m.rays, 1 + s.uniform + (2 if missing else 1) * s.near_depth)
     with Forbidding():
-        c2w, losses = one._loop(
-            job, one._bank.columns, missing, on_gpu(poses, 4, 4, dtype=torch.float64),
-            on_gpu(poses, 6, dtype=torch.float64), on_gpu(4), on_gpu(poses, 2, dtype=torch.int64),
-            on_gpu(m.rays, dtype=torch.int64), on_gpu(2, 3), draws,
+        views = DeviceViews(
+            one._bank.columns, on_gpu(24 * poses, dtype=torch.float64), on_gpu(m.rays, dtype=torch.int64),
+            on_gpu(2, 3), missing,
         )  # fmt: skip
-    assert (c2w.device.type, c2w.shape, losses.shape) == ("meta", (5, 4, 4), (4, 5))
+        c2w, losses, sound = one._loop(job, views, draws, on_gpu(4))
+    assert (c2w.device.type, c2w.shape, losses.shape, sound.shape) == ("meta", (5, 4, 4), (4, 5), (1,))
 
 
 class Sending(TorchDispatchMode):
@@ -231,11 +231,10 @@ class Sending(TorchDispatchMode):
 
 def test_what_a_mapping_needs_is_sent_without_waiting(gpu, config, room, monkeypatch):
     monkeypatch.setattr("ecslam.mapper.seeded", lambda rng, device: None)
-    monkeypatch.setattr("ecslam.mapper.uniform", lambda generator, device, *shape: torch.empty(shape, device=device))
     one, (views, poses) = empty_mapper(gpu), keyframes(room, config)
     job = Job(config, move=True, smooth=False, settle=False)
     with Sending():
-        c2w, losses = one._on_device(job, views, poses, np.arange(3) == 0, 4, lambda: None)
+        c2w, losses, _ = one._on_device(job, views, poses, np.arange(3) == 0, 4, lambda: None)
     assert (c2w.device.type, c2w.shape, losses.shape) == ("meta", (3, 4, 4), (4, 5))
 
 
@@ -286,8 +285,10 @@ def test_a_bank_holds_every_view_once_and_grows(monkeypatch):
 def test_rays_come_from_their_own_view_in_the_shares_asked_for(config):
     views = [flat(count, value) for count, value in ((5, 1), (1, 2), (40, 3))]
     bank, generator = PixelBank(CPU), torch.Generator().manual_seed(0)
-    chosen = device_views(bank, views, 5, config, torch.from_numpy(BOX).float(), CPU)
-    jitter = uniform(generator, CPU, 2, config.mapping.rays, chosen.numbers(config))
+    box, still = torch.from_numpy(BOX).float(), np.zeros((3, 6))
+    desk = Desk(5, config.mapping.rays, CPU)
+    chosen = desk.lay_out(bank, views, np.tile(np.eye(4), (3, 1, 1)), still, config.mapping.newest_share, box)
+    jitter = desk.jitter(2, chosen.jitter(config), generator)
     rays = DeviceDraw(chosen, jitter, torch.eye(4).expand(5, 4, 4), config, None, reference)(1, None)
     assert len(rays.depth) == config.mapping.rays
     assert (rays.pose.diff() >= 0).all()
@@ -301,8 +302,9 @@ def test_rays_drawn_at_once_are_those_that_each_iteration_would_draw(room, confi
     views, poses = keyframes(room, config, holes)
     one = mapper(room, config)
     c2w, box = torch.from_numpy(poses), one.field.layout.box
-    chosen = device_views(one._bank, views, len(views), config, box, CPU)
-    jitter = uniform(torch.Generator().manual_seed(0), CPU, 3, config.mapping.rays, chosen.numbers(config))
+    desk, rates = Desk(len(views), config.mapping.rays, CPU), np.zeros((len(views), 6))
+    chosen = desk.lay_out(one._bank, views, poses, rates, config.mapping.newest_share, box)
+    jitter = desk.jitter(3, chosen.jitter(config), torch.Generator().manual_seed(0))
     assert chosen.missing == (holes > 0)
     together = DeviceDraw(chosen, jitter, c2w, config, one.field, one.kernels)
     for i in range(3):

@@ -1,7 +1,6 @@
 """Recorded loops: what is run plainly, what is replayed, and what happens when recording is impossible."""
 
 from contextlib import contextmanager, nullcontext
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -68,9 +67,28 @@ def test_another_size_key_or_object_is_another_graph(change):
         a, b = a.double(), b.double()
     key, over = (2 if change == "key" else 1), ((new,) if change == "over" else (old,))
     recorder(halves, a, b, key=key, over=over)
-    assert graphs.replayed == 1
+    known = change == "over"  # then nothing is left to compile, and it is recorded at once
+    assert graphs.replayed == 1 + known
     recorder(halves, a, b, key=key, over=over)
-    assert (graphs.recorded, graphs.replayed) == (2, 2)
+    assert (graphs.recorded, graphs.replayed) == (2, 2 + known)
+
+
+def test_lent_results_are_those_of_the_graph_itself():
+    graphs, kept = FakeGraphs(), []
+    recorder = Recorder(capture=graphs.capture)
+    for x in (1.0, 2.0, 3.0):
+        kept.append(recorder(lambda a: (a + 1,), torch.full((1,), x), key=0, lent=True)[0])
+        assert kept[-1] == x + 1
+    assert graphs.replayed == 2
+
+
+def test_what_is_given_nothing_runs_where_it_is_told():
+    graphs, state = FakeGraphs(), torch.zeros(1)
+    recorder = Recorder(capture=graphs.capture)
+    for _ in range(3):
+        recorder(lambda: (state.add_(1),), key=0, over=(state,), device=torch.device("cpu"))
+    assert state == 3
+    assert (graphs.recorded, graphs.replayed) == (1, 2)
 
 
 def test_what_is_forgotten_is_recorded_again():
@@ -123,29 +141,26 @@ def test_after_a_recording_that_fails_the_thread_is_in_its_own_stream(monkeypatc
             now[0] = before
 
     class Graph:
-        """Like torch's, which restores no stream when the recording cannot be ended."""
+        """Like CUDA's: a recording in which something was not permitted cannot be ended."""
 
-        def __init__(self, graph, capture_error_mode):
-            assert capture_error_mode == "thread_local"
+        def capture_begin(self, pool, capture_error_mode):
+            assert (now, pool, capture_error_mode) == (["recording"], (0, 1), "thread_local")
 
-        def __enter__(self):
-            now[0] = "recording"
-
-        def __exit__(self, *error):
-            now[0] = "recording" if error[0] else "own"
+        def capture_end(self):
+            raise RuntimeError("operation failed due to a previous error during capture")
 
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
-    monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=None))
-    monkeypatch.setattr(torch.cuda, "graph", Graph)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
+    monkeypatch.setattr("ecslam.kernels.graphs._lane", lambda device: "recording")
     monkeypatch.setattr(torch.cuda, "stream", stream)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: now[0])
 
     def refuse():
         assert now == ["recording"]
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    with pytest.raises(RuntimeError, match="not permitted"):
-        capture_cuda(refuse, torch.device("cuda"))
+    with pytest.raises(RuntimeError, match="previous error") as raised:
+        capture_cuda(refuse, torch.device("cuda"), (0, 1))
+    assert "not permitted" in str(raised.value.__context__)
     assert now == ["own"]
 
 

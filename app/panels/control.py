@@ -29,7 +29,7 @@ from .. import theme
 from ..hub import Hub
 from ..panel import BasePanel, put
 
-SCHEDULES = ("strict", "overlap")
+SCHEDULES = ("auto", "strict", "overlap")
 OVER = (State.FINISHED, State.FAILED)
 _VERBS: dict[str, Command] = {"Pause": Pause(), "Resume": Resume(), "Step": Step()}
 STOP, REALLY, CANCEL = "Stop", "Stop for good", "Cancel"
@@ -133,7 +133,7 @@ class Panel(BasePanel):
                 "Schedule",
                 SCHEDULES,
                 initial_value=given.schedule,
-                hint="strict: repeatable; overlap: mapping in parallel",
+                hint="strict: repeatable on a CPU; overlap: mapping in parallel; auto: overlap on a GPU, else strict",
             )
             self._realtime = gui.add_checkbox(
                 "Real time", given.realtime, hint="As from a camera: frames are left out to keep up with the recording"

@@ -10,9 +10,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch.cuda import _POOL_HANDLE as Pool
 
 Tensors = tuple[Tensor, ...]
 Capture = Callable[[Callable[[], Tensors], torch.device], tuple[Callable[[], None], Tensors]]
@@ -30,62 +35,86 @@ class _Held:
     replay: Callable[[], None] | None = None
 
 
-def capture_cuda(function: Callable[[], Tensors], device: torch.device) -> tuple[Callable[[], None], Tensors]:
-    """Record ``function`` without running it: how to replay it, and where its results then lie.
+def capture_cuda(
+    function: Callable[[], Tensors], device: torch.device, pool: Pool
+) -> tuple[Callable[[], None], Tensors]:
+    """Record ``function`` without running it: how to replay it, and where its results then lie. pool: whose memory it
+    takes (``torch.cuda.graph_pool_handle``).
 
-    Only this thread's calls count as forbidden ones: tracking and mapping may use the device at the same time. After a
-    recording that fails torch stays in the stream it recorded in, so the thread's own one is taken up again here.
+    Only this thread's calls count as forbidden ones: tracking and mapping may use the device at the same time. Not by
+    ``torch.cuda.graph``, which first waits for the device and empties torch's caches; others are using these.
     """
-    with _recording, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
+    with _recording, torch.cuda.device(device), torch.cuda.stream(_lane(device)):
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+        try:
             outputs = function()
+        finally:
+            graph.capture_end()
     return graph.replay, outputs
+
+
+@cache
+def _lane(device: torch.device) -> torch.cuda.Stream:
+    """The stream that is recorded in, which is never the one that work is in."""
+    return torch.cuda.Stream(device)
 
 
 class Recorder:
     """Calls functions, and from the second call of one with the same sizes on replays it as a CUDA graph.
 
     The first call runs plainly, which also compiles kernels and fills caches, so nothing runs that was not asked for
-    and a function may change what it holds in place. If it is to be ``plain``, without CUDA, and once recording has
-    failed, every call is plain; ``failure`` then says why. Results are copies. ``keep`` graphs are kept, the least
-    recently used go first. One thread may use it at a time.
+    and a function may change what it holds in place. Over other objects it is recorded at once. If it is to be
+    ``plain``, without CUDA, and once recording has failed, every call is plain; ``failure`` then says why. Results are
+    copies. ``keep`` graphs are kept, the least recently used go first. One thread may use it at a time, in one stream:
+    its graphs share their memory.
     """
 
     def __init__(self, keep: int = 4, capture: Capture | None = None, plain: bool = False) -> None:
         self.failure = ""
         self._keep, self._capture, self._plain = keep, capture, plain
         self._held: dict[Hashable, _Held] = {}
+        self._called: set[Hashable] = set()
+        self._pool: Pool | None = None
 
     def __call__(
-        self, function: Callable[..., Tensors], *inputs: Tensor, key: Hashable, over: tuple[object, ...] = ()
+        self,
+        function: Callable[..., Tensors],
+        *inputs: Tensor,
+        key: Hashable,
+        over: tuple[object, ...] = (),
+        device: torch.device | None = None,
+        lent: bool = False,
     ) -> Tensors:
-        """``function(*inputs)``, with at least one input.
+        """``function(*inputs)``.
 
         key: which function it is, and all the values, beside the inputs' sizes, that decide what it launches. over:
         objects with tensors that it reads or changes without being given them; another object means another graph.
+        device: where it runs, if there are no inputs. lent: the results need not be copies; the next call of anything
+        overwrites them.
         """
-        device = inputs[0].device
+        device = device or inputs[0].device
         if self._plain or self.failure or not (self._capture or device.type == "cuda"):
             return function(*inputs)
-        sizes = tuple((t.shape, t.dtype, t.device) for t in inputs)
-        whole = (key, sizes, tuple(id(held) for held in over))
-        held = self._held.pop(whole, None)
-        if held is None:
-            self._remember(whole, _Held(over))
-            return function(*inputs)
+        sizes = key, tuple((t.shape, t.dtype, t.device) for t in inputs)
+        whole = sizes, tuple(map(id, over))
+        held = self._held.pop(whole, None) or _Held(over)
         self._remember(whole, held)
+        if sizes not in self._called:
+            self._called.add(sizes)
+            return function(*inputs)
         if held.replay is None and not self._record(held, function, inputs, device):
             return function(*inputs)
         assert held.replay is not None
         for mine, given in zip(held.inputs, inputs, strict=True):
             mine.copy_(given)
         held.replay()
-        return tuple(t.clone() for t in held.outputs)
+        return held.outputs if lent else tuple(t.clone() for t in held.outputs)
 
     def forget(self) -> None:
         """Give up all graphs, and the memory that they hold."""
         self._held.clear()
+        self._called.clear()
 
     def _remember(self, whole: Hashable, held: _Held) -> None:
         for oldest in list(self._held)[: max(0, len(self._held) + 1 - self._keep)]:
@@ -95,10 +124,16 @@ class Recorder:
     def _record(self, held: _Held, function: Callable[..., Tensors], inputs: Tensors, device: torch.device) -> bool:
         mine = tuple(t.clone() for t in inputs)
         try:
-            held.replay, held.outputs = (self._capture or capture_cuda)(lambda: function(*mine), device)
+            held.replay, held.outputs = (self._capture or self._capture_cuda)(lambda: function(*mine), device)
         except RuntimeError as error:
             self.failure = f"no CUDA graph: {error}"
             self._held.clear()
             return False
         held.inputs = mine
         return True
+
+    def _capture_cuda(
+        self, function: Callable[[], Tensors], device: torch.device
+    ) -> tuple[Callable[[], None], Tensors]:
+        self._pool = self._pool or torch.cuda.graph_pool_handle()
+        return capture_cuda(function, device, self._pool)

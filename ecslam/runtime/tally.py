@@ -42,7 +42,7 @@ class Tally:
     def add(self, report: StepReport) -> None:
         """Count a frame that was processed."""
         if self.rows:
-            self.engine_ms += report.track_ms + report.map_ms
+            self.engine_ms += report.step_ms
         self.rows.append(report.frame)
         self.lost += report.lost
         self.loops += report.loop is not None
