@@ -26,6 +26,14 @@ def orthonormalise(c2w: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
+def polished(c2w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The nearest rigid motion to [..., 4, 4] that products and their rounding have taken off by a millionth at most:
+    one step of Newton's iteration, a fraction of what ``orthonormalise`` takes."""
+    out, r = c2w.copy(), c2w[..., :3, :3]
+    out[..., :3, :3] = 1.5 * r - 0.5 * (r @ (np.swapaxes(r, -1, -2) @ r))
+    return out
+
+
 def is_rigid(c2w: NDArray[np.float64]) -> bool:
     """Whether an array is a 4x4 matrix of a rigid motion, to about a hundredth."""
     if c2w.shape != (4, 4) or not np.isfinite(c2w).all():

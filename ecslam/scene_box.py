@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from .config import FieldConfig
 from .field import box_of_points
-from .indices import evenly
 from .pixels import Pixels
 
 OUTSIDE_SHARE = 0.01
@@ -31,10 +30,12 @@ class SceneBox:
     ) -> tuple[NDArray[np.float64] | None, str]:
         """What to extend ``box`` [2, 3] by where over 1 % of a keyframe's points lie outside it, else None; and a note.
         A box from the configuration stays, and the note says how many lie outside, again when they have doubled."""
-        points = pixels.take(evenly(len(pixels), POINTS)).in_world(c2w)
+        points = pixels.every(-(-len(pixels) // POINTS) or 1).in_world(c2w)
         low, high = box
+        if not len(points) or ((points.min(0) >= low) & (points.max(0) <= high)).all():
+            return None, ""
         x, y, z = ((points < low) | (points > high)).T
-        outside = np.mean(x | y | z) if len(points) else 0.0
+        outside = np.mean(x | y | z)
         if self._config.box is None:
             return self._around(points) if outside > OUTSIDE_SHARE else None, ""
         if outside <= max(OUTSIDE_SHARE, 2 * self._told):

@@ -12,11 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .rigid import inverse, orthonormalise, rotation_angle_deg
+from .rigid import inverse, orthonormalise, polished, rotation_angle_deg
 
 __all__ = [
     "inverse",
     "orthonormalise",
+    "polished",
     "repeated",
     "retract",
     "rotation_angle_deg",

@@ -29,7 +29,7 @@ from .keyframes import Keyframe, Shelf, make_keyframe, surface_points
 from .loops import LoopDetector, loop_event
 from .mapper import Mapper, Mapping, MapResult
 from .messages import MOVING, LoopEvent, StepReport
-from .rigid import is_rigid
+from .rigid import is_rigid, orthonormalise
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
 from .scene_box import SceneBox
 from .shutter import STILL
@@ -93,6 +93,7 @@ class Slam:
         self._first_pose = np.eye(4) if first_pose is None else np.array(first_pose, np.float64)
         if not is_rigid(self._first_pose):
             raise InputError("first_pose is no 4x4 matrix of a rigid motion, from the camera to the world in metres")
+        self._first_pose = orthonormalise(self._first_pose)
         self._box = SceneBox(config.field, bounds)
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)

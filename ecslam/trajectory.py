@@ -33,15 +33,15 @@ class Trajectory:
         return np.asarray(self._keyframes[self._anchor[index]] @ self._relative[index])
 
     def append(self, c2w: NDArray[np.float64], timestamp: float, keyframe: bool) -> None:
-        """Add a frame. The first one must be a keyframe."""
+        """Add a frame, whose pose is rigid up to rounding. The first one must be a keyframe."""
         if keyframe:
             self._keyframes = _with_room(self._keyframes, self._keyframe_count)
-            self._keyframes[self._keyframe_count] = se3.orthonormalise(c2w)
+            self._keyframes[self._keyframe_count] = se3.polished(c2w)
             self._keyframe_count += 1
         self._relative = _with_room(self._relative, self._count)
         self._anchor = _with_room(self._anchor, self._count)
         self._anchor[self._count] = self._keyframe_count - 1
-        self._relative[self._count] = se3.orthonormalise(se3.inverse(self._keyframes[self._anchor[self._count]]) @ c2w)
+        self._relative[self._count] = se3.polished(se3.inverse(self._keyframes[self._anchor[self._count]]) @ c2w)
         self._count += 1
         self.timestamps.append(timestamp)
 
@@ -51,7 +51,7 @@ class Trajectory:
 
     def move_keyframes(self, index: NDArray[np.int64], c2w: NDArray[np.float64]) -> None:
         """Set keyframe poses [K, 4, 4] at ``index`` [K]; the frames that hang on them follow."""
-        self._keyframes[index] = se3.orthonormalise(c2w)
+        self._keyframes[index] = se3.polished(c2w)
 
     def poses(self) -> NDArray[np.float64]:
         """Poses [N, 4, 4] of all frames."""
@@ -69,7 +69,7 @@ class Trajectory:
         steps = (timestamp - last) / (last - before) if last > before else 1.0
         if abs(steps - 1) > UNEVEN:
             motion = se3.repeated(motion, min(max(steps, 0.0), MOST_STEPS))
-        return se3.orthonormalise(self[-1] @ motion)
+        return se3.polished(self[-1] @ motion)
 
     def state(self) -> dict[str, NDArray[np.generic]]:
         """Everything as arrays, for a checkpoint."""

@@ -31,7 +31,7 @@ from ecslam.pixels_gpu import straight_pixels as straight_on_device
 from ecslam.rays import upload
 from ecslam.shutter import STILL, straight_pixels
 from ecslam.tracker import HostTracker
-from ecslam.tracker_gpu import TOLD, GpuTracker
+from ecslam.tracker_gpu import HEAD, TOLD, GpuTracker
 from ecslam.volume import FusedVolume, create_volume
 from ecslam.volume_gpu import GpuVolume
 

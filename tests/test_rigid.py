@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ecslam.rigid import best_motion, orthonormalise, quaternions, rotations
+from ecslam.rigid import best_motion, orthonormalise, polished, quaternions, rotations
 
 HALF_TURNS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -2, 3], [-1, 2, 2]])
 
@@ -51,3 +51,15 @@ def test_the_best_motion_is_that_of_scipy_for_each_of_many_and_never_a_reflectio
         assert np.allclose(found[:3, :3], turn.as_matrix())
         assert np.allclose(found[:3, :3] @ a.mean(0) + found[:3, 3], b.mean(0))
         assert found[3].tolist() == [0, 0, 0, 1]
+
+
+def test_what_rounding_has_bent_is_polished_as_by_a_decomposition():
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, :3, :3] = rotations(rng.normal(size=(20, 4)))
+    poses[:, :3, 3] = rng.normal(size=(20, 3))
+    bent = poses.copy()
+    bent[:, :3, :3] += 1e-7 * rng.normal(size=(20, 3, 3))
+    np.testing.assert_allclose(polished(bent), orthonormalise(bent), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(polished(bent[3]), polished(bent)[3])
+    np.testing.assert_allclose(polished(poses), poses, rtol=0, atol=1e-15)
