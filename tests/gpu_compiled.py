@@ -18,6 +18,7 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime.jit import JITFunction
 
 from ecslam.config import FieldConfig
+from ecslam.field_adam import FieldAdam
 
 torch.cuda.is_available, available = lambda: True, torch.cuda.is_available
 from ecslam.kernels import PoseMoments, Rules, fusion_gpu, gpu, tracking_gpu  # noqa: E402
@@ -55,7 +56,9 @@ def launch_the_map(variants):
         gpu.gradients(layout, params, points)
         gpu.normal_equations(layout, params, c2w[0], points, points[:, 0].contiguous(), ALIGN)
     gpu.render(layout, params, c2w, rays)
-    gpu.step(layout, params, c2w, rays, WEIGHTS, blank(params), True)
+    of_table, of_others = FieldAdam(list(vars(params).values())).steps(torch.tensor(1e-2), 1e-2)
+    gpu.step(layout, params, c2w, rays, WEIGHTS, blank(params), True, of_table)
+    gpu.map_step(*[[params.w_in, params.w_sdf, params.w_rgb, params.beta]] * 2, of_others)
     poses = torch.eye(4).double().repeat(30, 1, 1)
     mean, square, rates = (torch.zeros(30, 6).double() for _ in range(3))
     moments = PoseMoments(mean, square, torch.zeros(30, 3).double(), (0.5, 0.9), 1e-8)

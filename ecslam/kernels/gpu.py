@@ -1,10 +1,10 @@
 """The fused GPU back end (Triton): kernels over blocks of points and of rays.
 
-A step is six launches, seven if the map learns: clear; place; encode and decode; render, compare and differentiate;
-decoders back; weights back; grid back. In between lie places, TSDF, colour, hidden units and the grid's features, and
-their gradients, which a GPU's cache holds. No launch waits for the host, sizes depend on shapes alone and memory comes
-from torch, so a CUDA graph can record whole loops (``graphs``). Sums are taken by atomics in varying order: results
-vary in their last digits.
+A step is six launches: clear; place; encode and decode; render, compare and differentiate; decoders back; grid back. If
+the map learns there are two more: weights back, and the table's step. In between lie places, TSDF, colour, hidden units
+and the grid's features, and their gradients, which a GPU's cache holds. No launch waits for the host, sizes depend on
+shapes alone and memory comes from torch, so a CUDA graph can record whole loops (``graphs``). Sums are taken by atomics
+in varying order: results vary in their last digits.
 
 With TRITON_INTERPRET=1 the same code runs in Triton's interpreter on the CPU, for the tests.
 """
@@ -38,9 +38,9 @@ from ._gpu_device import beside, processors
 from ._gpu_field import Field, Shape
 from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, place_kernel, values_kernel, weights_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
+from .adam_gpu import map_step as map_step
 from .depths_gpu import importance_depths as importance_depths
 from .poses_gpu import pose_step as pose_step
-from .reference import map_step as map_step
 from .reference import smoothness as smoothness
 from .reference_depths import sample_depths as sample_depths
 
