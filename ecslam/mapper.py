@@ -177,7 +177,7 @@ class Mapper:
             poses, found, sound = recorder(
                 partial(self._loop, job, chosen, jitter),
                 left,
-                key=(job.move, job.smooth, job.settle, chosen.missing),
+                key=(id(config), job.move, job.smooth, job.settle, chosen.missing),
                 over=(self.field, self._optimiser, config, chosen.pixels, chosen.numbers, chosen.row, jitter),
                 lent=True,
             )

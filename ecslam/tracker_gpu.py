@@ -64,7 +64,7 @@ class GpuTracker:
         order = _shuffled(grid_cells(shown, rays, config) if rays else 0, device)
         rates = _rates(t.lr_rotation, t.lr_translation, device)
         over = field if rays else None, self.volume.blocks, config, shown, order, rates, letter.there, dice.rows
-        (found,) = self.recorder(partial(self._whole, *over), key=None, over=over, device=device, lent=True)
+        (found,) = self.recorder(partial(self._whole, *over), key=id(config), over=over, device=device, lent=True)
         told = found.cpu().numpy()
         pose, (cost, fit, usable), terms = told[:12], told[12:TOLD].tolist(), told[TOLD:]
         if usable < LEAST_POINTS:

@@ -129,6 +129,23 @@ def test_where_recording_fails_everything_runs_plainly():
     assert "not permitted" in recorder.failure
 
 
+def test_what_cannot_be_recorded_at_once_is_recorded_after_a_plain_call():
+    """Over new objects something may be left to compile, or to upload."""
+    graphs, tried = FakeGraphs(), []
+
+    def capture(function, device):
+        tried.append(device)
+        if len(tried) == 2:
+            raise RuntimeError("operation not permitted when stream is capturing")
+        return graphs.capture(function, device)
+
+    recorder, old, new = Recorder(capture=capture), torch.zeros(1), torch.zeros(1)
+    for state in (old, old, new, new, new):
+        assert recorder(halves, *pair(1.0), key=0, over=(state,))[0][0] == 1
+    assert recorder.failure == ""
+    assert (len(tried), graphs.recorded, graphs.replayed) == (3, 2, 3)
+
+
 def test_after_a_recording_that_fails_the_thread_is_in_its_own_stream(monkeypatch):
     now = ["own"]
 

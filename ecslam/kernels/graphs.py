@@ -27,9 +27,11 @@ _recording = threading.Lock()  # torch has one stream to record in, whichever th
 
 @dataclass
 class _Held:
-    """What is kept for one key: objects whose addresses a graph holds and, once recorded, its inputs and outputs."""
+    """What is kept for one key: objects whose addresses a graph holds and, once recorded, its inputs and outputs.
+    ran: whether it has been called plainly."""
 
     over: tuple[object, ...]
+    ran: bool = False
     inputs: Tensors = ()
     outputs: Tensors = ()
     replay: Callable[[], None] | None = None
@@ -64,10 +66,10 @@ class Recorder:
     """Calls functions, and from the second call of one with the same sizes on replays it as a CUDA graph.
 
     The first call runs plainly, which also compiles kernels and fills caches, so nothing runs that was not asked for
-    and a function may change what it holds in place. Over other objects it is recorded at once. If it is to be
-    ``plain``, without CUDA, and once recording has failed, every call is plain; ``failure`` then says why. Results are
-    copies. ``keep`` graphs are kept, the least recently used go first. One thread may use it at a time, in one stream:
-    its graphs share their memory.
+    and a function may change what it holds in place. Over other objects it is recorded at once, if that is possible. If
+    it is to be ``plain``, without CUDA, and once recording has failed after a plain call, every call is plain;
+    ``failure`` then says why. Results are copies. ``keep`` graphs are kept, the least recently used go first. One
+    thread may use it at a time, in one stream: its graphs share their memory.
     """
 
     def __init__(self, keep: int = 4, capture: Capture | None = None, plain: bool = False) -> None:
@@ -100,10 +102,10 @@ class Recorder:
         whole = sizes, tuple(map(id, over))
         held = self._held.pop(whole, None) or _Held(over)
         self._remember(whole, held)
-        if sizes not in self._called:
+        known = sizes in self._called
+        if not known or (held.replay is None and not self._record(held, function, inputs, device)):
             self._called.add(sizes)
-            return function(*inputs)
-        if held.replay is None and not self._record(held, function, inputs, device):
+            held.ran = True
             return function(*inputs)
         assert held.replay is not None
         for mine, given in zip(held.inputs, inputs, strict=True):
@@ -126,8 +128,9 @@ class Recorder:
         try:
             held.replay, held.outputs = (self._capture or self._capture_cuda)(lambda: function(*mine), device)
         except RuntimeError as error:
-            self.failure = f"no CUDA graph: {error}"
-            self._held.clear()
+            if held.ran:
+                self.failure = f"no CUDA graph: {error}"
+                self._held.clear()
             return False
         held.inputs = mine
         return True
