@@ -23,7 +23,7 @@ from .pose_adam import PoseAdam, pose_rates
 from .rays import kernel_weights
 from .samples import seeded, smooth_lattice
 from .saving import Arrays, pack_field, pack_random, part, prefixed, unpack_field, unpack_random
-from .since import Since
+from .sending import Since
 
 MIN_BETA = 1.0
 CHUNK = 10  # iterations in a CUDA graph where no pose moves

@@ -1,6 +1,8 @@
-"""Numbers for recorded loops on a device, at fixed places: sent in one copy, or drawn many at a time."""
+"""Numbers on their way to a device and back, which nothing waits for. Recorded loops find them at fixed places."""
 
 from __future__ import annotations
+
+import time
 
 import numpy as np
 import torch
@@ -49,3 +51,39 @@ class Dice:
             self._left = self.ROWS
         self._left -= 1
         return self._left
+
+
+class Since:
+    """A stopwatch from when it is made to when the result of the work in between is sent for; on a GPU that is work of
+    the current stream, and nothing waits."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._took_s, self._began_s = 0.0, time.perf_counter()
+        self._marks = [_mark()] if device.type == "cuda" else []
+
+    def bring(self, result: Tensor) -> Tensor:
+        """The ``result`` on the host, where it will have arrived when the work is ``done``."""
+        if not self._marks:
+            self._took_s = time.perf_counter() - self._began_s
+            return result.cpu()
+        here = torch.empty(result.shape, dtype=result.dtype, pin_memory=True).copy_(result, non_blocking=True)
+        self._marks.append(_mark())
+        return here
+
+    def done(self) -> bool:
+        """Whether the result has arrived."""
+        return not self._marks or self._marks[-1].query()
+
+    def seconds(self) -> float:
+        """How long it took, once the result has arrived; waits for that."""
+        if not self._marks:
+            return self._took_s
+        began, ended = self._marks
+        ended.synchronize()
+        return 1e-3 * began.elapsed_time(ended)
+
+
+def _mark() -> torch.cuda.Event:
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event

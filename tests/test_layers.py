@@ -34,6 +34,7 @@ LAYERS = (
         "shutter",
         "landmarks",
         "samples",
+        "sending",
         "rays",
         "observed",
         "observed_gpu",

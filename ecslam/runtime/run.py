@@ -14,10 +14,8 @@ from .. import config_files
 from ..config import Config
 from ..datasets.check import lacking_depth, odd_depth
 from ..datasets.views import in_order, problems
-from ..evaluation.trajectory import Spread, absolute_error
 from ..evaluation.trajectory_io import format_tum
 from ..messages import MOVING, Event, LoopEvent, Notice, StepReport
-from ..rigid import rotation_angle_deg
 from ..types import Frame, FrameError, InputError
 from .checkpoint import Checkpoint
 from .checkpoint_writer import CheckpointWriter
@@ -31,6 +29,7 @@ from .plan import Plan
 from .runfolder import RunFolder, read_about
 from .summary import summarise
 from .tally import Every, Stopwatch, Tally
+from .truth import Truth
 
 ATE_EVERY = 10
 TRAJECTORY_EVERY_S, HOLES_EVERY_S = 5.0, 0.4
@@ -58,11 +57,10 @@ class Run:
         self.slam: SlamLike | None = None
         self.tally = Tally(**resumed.meta["tally"]) if resumed else Tally()
         self.clock = Stopwatch(self.tally.wall_s)
-        self.truth = _known(plan.sequence.poses_gt())
+        self.truth = Truth(plan.sequence.poses_gt())
         self._in_order = in_order(plan.sequence.timestamps())
         self.torn = False
         self.report: StepReport | None = None
-        self.ate_cm: Spread | None = None
         self.map_loss: float | None = None
         self.last_mapping = ""
         self.loops: list[LoopEvent] = []
@@ -109,10 +107,10 @@ class Run:
     def _write_inputs(self) -> None:
         """Also where a run goes on: both may have been lost since."""
         self.folder.write("config.yaml", config_files.to_yaml(self.config))
-        if self.truth is not None:
-            known = np.isfinite(self.truth).all((1, 2)) & self._in_order
+        if (truth := self.truth.poses) is not None:
+            known = np.isfinite(truth).all((1, 2)) & self._in_order
             times = self.plan.sequence.timestamps()
-            self.folder.write("groundtruth.txt", format_tum(times[known], self.truth[known]))
+            self.folder.write("groundtruth.txt", format_tum(times[known], truth[known]))
 
     # ---- frames ---------------------------------------------------------------------------------------------------
 
@@ -155,7 +153,7 @@ class Run:
         report = slam.step(frame, interrupt)
         if report.loop is None:
             return report
-        return replace(report, loop=self._with_errors(report.loop, report.c2w))
+        return replace(report, loop=self.truth.with_errors(report.loop, report.c2w, self.tally))
 
     def _build(self, first_pose: NDArray[np.float64] | None, state: Arrays | None) -> SlamLike:
         sequence = self.plan.sequence
@@ -169,19 +167,6 @@ class Run:
         if running:
             self.clock.resume()
         return self.slam
-
-    def _with_errors(self, loop: LoopEvent, after: NDArray[np.float64]) -> LoopEvent:
-        truth = None if self.truth_in_map is None else self.truth_in_map[loop.frame]
-        if truth is None or loop.c2w_before is None or not np.isfinite(truth).all():
-            return loop
-        before = loop.c2w_before
-        return replace(
-            loop,
-            error_before_cm=100 * float(np.linalg.norm(before[:3, 3] - truth[:3, 3])),
-            error_after_cm=100 * float(np.linalg.norm(after[:3, 3] - truth[:3, 3])),
-            rotation_error_before_deg=float(rotation_angle_deg(before, truth)),
-            rotation_error_after_deg=float(rotation_angle_deg(after, truth)),
-        )
 
     def _skip(self, index: int, why: str) -> None:
         self.tally.skipped += 1
@@ -234,7 +219,8 @@ class Run:
             self.measure()
         if report.is_keyframe:
             self.folder.keyframe(report.frame, report.c2w, jpeg(shrink(frame.color, THUMBNAIL_WIDTH)))
-        self.folder.metrics(report, self.ate_cm.rmse if self.ate_cm else None, self._window_poses(report))
+        ate_cm = self.truth.ate_cm
+        self.folder.metrics(report, ate_cm.rmse if ate_cm else None, self._window_poses(report))
         if report.loop is not None:
             self.loops.append(report.loop)
             self.folder.event(report.loop)
@@ -291,22 +277,9 @@ class Run:
         """[n] seconds of the processed frames."""
         return np.array(self.slam.trajectory.timestamps[: len(self.tally.rows)] if self.slam else [], np.float64)
 
-    @property
-    def truth_in_map(self) -> NDArray[np.float64] | None:
-        """True poses [N, 4, 4] in the world of the map; None where the first processed frame (or that at work) has
-        none, as the map then lies in a world of its own."""
-        first = self.tally.rows[0] if self.tally.rows else max(self.tally.position - 1, 0)
-        return self.truth if self.truth is not None and np.isfinite(self.truth[first]).all() else None
-
     def measure(self) -> None:
         """Bring the ATE up to date."""
-        error = None if self.truth is None else absolute_error(self.poses(), self.truth[self.tally.rows])
-        self.ate_cm = error.cm if error else None
-
-    @property
-    def without_truth(self) -> int | None:
-        """How many processed frames have no usable true pose and so no part in the ATE; None without ground truth."""
-        return None if self.truth is None else int((~np.isfinite(self.truth[self.tally.rows]).all((1, 2))).sum())
+        self.truth.measure(self.poses(), self.tally)
 
     def freeze(self, points: int = MESH_POINTS) -> FrozenMap | None:
         """The map as it is now, with about so many measured points at most; None before there is one."""
@@ -394,8 +367,3 @@ class Run:
         self.folder.write("summary.json", summary)
         self.folder.close()
         return summary | {"not_saved": dict(self.folder.not_saved)}
-
-
-def _known(truth: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """Ground truth [N, 4, 4], or None where no frame has a finite pose."""
-    return truth if truth is not None and np.isfinite(truth).all((1, 2)).any() else None

@@ -27,7 +27,7 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
     sequence, camera, report, tally = run.plan.sequence, run.plan.sequence.intrinsics, run.report, run.tally
     poses = run.poses()
     frames, keyframe_poses = run.keyframe_poses()
-    seconds = run.clock.seconds
+    seconds, ate_cm = run.clock.seconds, run.truth.ate_cm
     return Snapshot(
         state=state,
         sequence=sequence.name,
@@ -35,7 +35,7 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
         frame=max(tally.position - 1, 0),
         frames_total=len(sequence),
         trajectory=poses[tally.row_of_each_frame()] if len(poses) else poses,
-        trajectory_gt=run.truth_in_map,
+        trajectory_gt=run.truth.in_map(tally),
         keyframes=tuple(
             KeyframeView(frame, c2w, run.folder.picture(frame))
             for frame, c2w in zip(frames, keyframe_poses, strict=True)
@@ -49,7 +49,7 @@ def take_snapshot(run: Run, state: State, reason: str = "") -> Snapshot:
         map_ms=report.map_ms if report else 0.0,
         fps_wall=len(tally.rows) / seconds if seconds else 0.0,
         fps_engine=tally.fps_engine,
-        ate_cm=run.ate_cm.rmse if run.ate_cm else None,
+        ate_cm=ate_cm.rmse if ate_cm else None,
         memory_mb=peak_memory_mb(),
         loops=tuple(run.loops),
         skipped=tally.skipped,

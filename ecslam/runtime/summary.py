@@ -16,7 +16,7 @@ def summarise(run: Run, ended: str, error: str, export_s: float) -> dict[str, An
 
     ``ecslam eval`` adds the figures that need a reference mesh.
     """
-    tally, slam, ate = run.tally, run.slam, run.ate_cm
+    tally, slam, ate = run.tally, run.slam, run.truth.ate_cm
     parameters = slam.field.parameters if slam is not None and slam.field is not None else 0
     return {
         "sequence": run.plan.sequence.name,
@@ -44,7 +44,7 @@ def summarise(run: Run, ended: str, error: str, export_s: float) -> dict[str, An
         "lost_frames": tally.lost,
         "loop_closures": tally.loops,
         "unreadable_frames": tally.unreadable,
-        "frames_without_ground_truth": run.without_truth,
+        "frames_without_ground_truth": run.truth.unknown(tally),
         "warnings": tally.warnings,
         "export_s": round(export_s, 3),
         "not_saved": dict(run.folder.not_saved),
