@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import cv2
@@ -77,10 +78,12 @@ def cell_px(width: int) -> int:
     return max(1, round(width / COLUMNS))
 
 
-def cell_lens(camera: Intrinsics, cell: int) -> tuple[float, float, float, float]:
+@cache
+def cell_lens(camera: Intrinsics, cell: int) -> NDArray[np.float32]:
     """fx, fy, cx, cy of a camera whose pixels are the cells."""
     middle = (cell - 1) / 2
-    return camera.fx / cell, camera.fy / cell, (camera.cx - middle) / cell, (camera.cy - middle) / cell
+    centre = (camera.cx - middle) / cell, (camera.cy - middle) / cell
+    return np.array([camera.fx / cell, camera.fy / cell, *centre], np.float32)
 
 
 def to_views(c2w: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float32]:

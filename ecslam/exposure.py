@@ -16,7 +16,7 @@ from .kernels import earlier_views
 from .types import Frame, Intrinsics
 
 EVERY, SPARSE = 2, 2  # each which of the views that are asked, and each which of the frame's rows and columns of cells
-WITHIN_M, WITHIN_PER_M = 0.03, 0.01  # of each other, what two views measured of one surface
+WITHIN = np.array([0.03, 0.01], np.float32)  # metres, and share of the depth: what two views measure of one surface
 LEAST_PAIRS = 60
 NOTICED = 0.01  # smaller changes are left alone
 MOST = 8.0  # times brighter or darker than at first; more is a mistake
@@ -44,10 +44,11 @@ def _gain(
     if not keyframes:
         return None
     near, cell = relief_of(frame), cell_px(frame.depth.shape[1])
-    to_view = to_views(c2w, keyframe_poses[keyframes])
-    lens, within = (np.array(n, np.float32) for n in (cell_lens(camera, cell), (WITHIN_M, WITHIN_PER_M)))
+    to_view, lens = to_views(c2w, keyframe_poses[keyframes]), cell_lens(camera, cell)
     ratios = np.empty(len(keyframes) * near.size, np.float32)
-    found = earlier_views.ratios(near, light_of(frame), lens, to_view, seen, lights, within, EVERY, SPARSE, ratios)
+    found = earlier_views.ratios(near, light_of(frame), lens, to_view, seen, lights, WITHIN, EVERY, SPARSE, ratios)
     if found < LEAST_PAIRS:
         return None
-    return float(np.exp(np.median(ratios[:found])).clip(1 / MOST, MOST))
+    middle = (found - 1) // 2, found // 2
+    median = np.partition(ratios[:found], middle)[list(middle)].mean()
+    return min(max(float(np.exp(median)), 1 / MOST), MOST)

@@ -18,7 +18,7 @@ from .earlier import Cells, Views, cell_lens, cell_px, relief_of, to_views
 from .kernels import earlier_views
 from .types import Frame, Intrinsics
 
-FRONT_M, FRONT_PER_M = 0.1, 0.03  # a point has come that is so much nearer than what was seen
+FRONT = np.array([0.1, 0.03], np.float32)  # metres, and share of the depth: a point has come that is so much nearer
 LEAST, MOST = 0.006, 0.7  # of all cells: fewer are noise, more are a wrong pose
 SLOPE = 0.03  # of the depth, between neighbouring cells of one surface
 
@@ -34,8 +34,9 @@ def without_movers(
         return frame
     near, cell = relief_of(frame), cell_px(frame.depth.shape[1])
     came, settled = compare(near, cell_lens(camera, cell), c2w, earlier.seen, keyframe_poses[earlier.keyframes])
-    region = grown(large(came), near, ~settled)
-    if not region.any() or region.mean() > MOST:
+    seed = large(came)
+    region = grown(seed, near, ~settled) if seed.any() else seed
+    if not 0 < region.mean() <= MOST:
         return frame
     hidden = cv2.dilate(region.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     sides = zip(frame.depth.shape, near.shape, strict=True)
@@ -46,19 +47,18 @@ def without_movers(
 
 def compare(
     near: Cells,
-    lens: tuple[float, float, float, float],
+    lens: NDArray[np.float32],
     c2w: NDArray[np.float64],
     seen: NDArray[np.float32],
     poses: NDArray[np.float64],
 ) -> tuple[Mask, Mask]:
     """Which cells [h, w] lie in front of what one of the views saw there, and which where one of them saw a surface.
 
-    near: depth of the cells, from c2w [4, 4]. seen: what is ``around`` those of earlier views [V, 2, h, w], which are
-    from ``poses`` [V, 4, 4].
+    near: depth of the cells, from c2w [4, 4]. lens: see ``cell_lens``. seen: what is ``around`` those of earlier views
+    [V, 2, h, w], which are from ``poses`` [V, 4, 4].
     """
     came, settled = np.zeros((2, *near.shape), np.bool_)
-    front = np.array([FRONT_M, FRONT_PER_M], np.float32)
-    earlier_views.compare(near, np.array(lens, np.float32), to_views(c2w, poses), seen, front, came, settled)
+    earlier_views.compare(near, lens, to_views(c2w, poses), seen, FRONT, came, settled)
     return came, settled
 
 

@@ -10,7 +10,7 @@ from .field import box_of_points
 from .pixels import Pixels
 
 OUTSIDE_SHARE = 0.01
-POINTS = 8192  # of a keyframe, looked at to see whether the box holds them
+POINTS = 4096  # of a keyframe, about, looked at to see whether the box holds them
 
 
 class SceneBox:

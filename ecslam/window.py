@@ -34,15 +34,15 @@ def select_window(
     cap = max(2, min(config.size, rays // RAYS_PER_KEYFRAME))
     if count <= cap:
         return np.arange(count)
-    recent = np.arange(count - min(config.recent, cap - 1), count)
-    past = count - len(recent)
-    room = min(config.historic, cap - len(recent))
-    historic = evenly(past, room)
-    always = np.union1d(recent, historic)
+    recent = min(config.recent, cap - 1)
+    chosen = np.zeros(count, np.bool_)
+    chosen[count - recent :] = True
+    chosen[evenly(count - recent, min(config.historic, cap - recent))] = True
     distance, angle = parallax(keyframes, current)
-    order = np.lexsort((np.arange(count), distance))
-    near = order[(angle[order] <= config.max_angle_deg) & ~np.isin(order, always)]
-    return np.union1d(always, near[: cap - len(always)])
+    order = np.argsort(distance, kind="stable")
+    near = order[((angle <= config.max_angle_deg) & ~chosen)[order]]
+    chosen[near[: cap - np.count_nonzero(chosen)]] = True
+    return np.flatnonzero(chosen)
 
 
 def random_window(count: int, rays: int, config: WindowConfig, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -5,9 +5,9 @@ import pytest
 
 from ecslam.datasets import open_sequence
 from ecslam.earlier import SAMPLES, around, cell_lens, cell_px, light, relief
-from ecslam.exposure import WITHIN_M, WITHIN_PER_M
+from ecslam.exposure import WITHIN
 from ecslam.kernels import earlier_views
-from ecslam.movers import FRONT_M, FRONT_PER_M, compare
+from ecslam.movers import FRONT, compare
 from ecslam.rigid import inverse
 
 ROOM = open_sequence("synthetic/apartment?size=320x240&frames=120&visitor=1")
@@ -38,7 +38,7 @@ def held_against(near: np.ndarray, lens: tuple, c2w: np.ndarray, seen: np.ndarra
         inside &= abs(row - (near.shape[0] - 1) / 2) < near.shape[0] / 2
         at = np.where(inside, np.rint(row), 0).astype(int), np.where(inside, np.rint(column), 0).astype(int)
         known = inside & (least[at] > 0)
-        margin = FRONT_M + FRONT_PER_M * least[at]
+        margin = FRONT[0] + FRONT[1] * least[at]
         came |= known & (z < least[at] - margin)
         settled |= known & (z >= least[at] - margin) & (z < most[at] + margin)
         between = np.minimum(abs(column % 1 - 0.5), abs(row % 1 - 0.5)) < 1e-3
@@ -83,14 +83,11 @@ def test_ratios_are_those_of_the_cells_that_see_the_same(every, stride):
     frame = ROOM[73]
     near, lit, cell = relief(frame.depth), light(frame.color), cell_px(frame.depth.shape[1])
     assert (lit == 0).any()
-    lens = np.array(cell_lens(ROOM.intrinsics, cell), np.float32)
+    lens = cell_lens(ROOM.intrinsics, cell)
     seen, lights = np.stack([around(r) for r in reliefs]), np.stack([light(view.color) for view in views])
-    to_view, within = (
-        (inverse(poses) @ frame.c2w_gt)[:, :3].astype(np.float32),
-        np.array([WITHIN_M, WITHIN_PER_M], np.float32),
-    )
+    to_view = (inverse(poses) @ frame.c2w_gt)[:, :3].astype(np.float32)
     out = np.full(len(views) * near.size, np.nan, np.float32)
-    found = earlier_views.ratios(near, lit, lens, to_view, seen, lights, within, every, stride, out)
+    found = earlier_views.ratios(near, lit, lens, to_view, seen, lights, WITHIN, every, stride, out)
     assert np.isnan(out[found:]).all()
     assert np.isfinite(out[:found]).all()
     expected = []
@@ -103,7 +100,7 @@ def test_ratios_are_those_of_the_cells_that_see_the_same(every, stride):
             column, row = np.floor(x / ahead * fx + cx + 0.5), np.floor(y / ahead * fy + cy + 0.5)
         there = (z > 0) & (ahead > 0) & (column >= 0) & (row >= 0) & (column < near.shape[1]) & (row < near.shape[0])
         at = np.where(there, row, 0).astype(int), np.where(there, column, 0).astype(int)
-        margin = WITHIN_M + WITHIN_PER_M * least[at]
+        margin = WITHIN[0] + WITHIN[1] * least[at]
         there &= (least[at] > 0) & (ahead > least[at] - margin) & (ahead < most[at] + margin)
         there &= (theirs[at] > 0) & (lit[v, u] > 0)
         expected.append((theirs[at] - lit[v, u])[there])

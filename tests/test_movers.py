@@ -16,7 +16,7 @@ from ecslam.slam import Slam
 from ecslam.types import Frame
 
 ROOM = open_sequence("synthetic/studio?size=160x120&frames=300")
-LENS = (50.0, 50.0, 31.5, 23.5)
+LENS = np.array([50.0, 50.0, 31.5, 23.5], np.float32)
 HERE = np.eye(4)
 WALL = np.full((48, 64), 3, np.float32)
 
