@@ -57,51 +57,47 @@ def on_box(field, world, axis: tl.constexpr, shape: tl.constexpr):
 
 
 @triton.jit
-def locate(field, x, rest, axis: tl.constexpr, prime: tl.constexpr, shape: tl.constexpr):
-    """One axis at all levels [P, width]: the fraction within the cell, and what the two lattice points around it add
-    to a row number (a stride times the place where a level is dense, a factor of the hash where not)."""
-    level = tl.arange(0, shape.width)
+def locate(field, x, rest, level, axis: tl.constexpr, prime: tl.constexpr, shape: tl.constexpr):
+    """One axis of points at levels, tiles that broadcast: the fraction within the cell, and what the two lattice points
+    around it add to a row number (a stride times the place where a level is dense, a factor of the hash where not)."""
     known = level < shape.levels
-    inverse = tl.load(field.inverse + 2 * level, known, 0.0)[None, :]
-    correction = tl.load(field.inverse + 2 * level + 1, known, 0.0)[None, :]
-    wide = x[:, None] + tl.full([1, shape.width], 0, tl.float32)
+    inverse = tl.load(field.inverse + 2 * level, known, 0.0)
+    correction = tl.load(field.inverse + 2 * level + 1, known, 0.0)
+    wide = x + tl.zeros_like(inverse)
     cell = tl.floor(wide * inverse)
-    fraction = tl.fma(wide, inverse + tl.zeros_like(wide), -cell) + (rest[:, None] * inverse + wide * correction)
+    fraction = tl.fma(wide, inverse + tl.zeros_like(wide), -cell) + (rest * inverse + wide * correction)
     over = tl.floor(fraction)
     at = field.levels + 8 * level
-    first = tl.load(at + 2 + axis, known, 0)[None, :]
-    last = tl.load(at + 5 + axis, known, 0)[None, :] - 1
-    stride = tl.full([shape.width], 1, tl.int32)
+    first = tl.load(at + 2 + axis, known, 0)
+    last = tl.load(at + 5 + axis, known, 0) - 1
+    stride = tl.full(level.shape, 1, tl.int32)
     if axis >= 1:
         stride *= tl.load(at + 5, known, 0)
     if axis == 2:
         stride *= tl.load(at + 6, known, 0)
     k = (cell + over).to(tl.int32)
-    near = tl.minimum(tl.maximum(k - first, 0), last) * stride[None, :]
-    far = tl.minimum(tl.maximum(k + 1 - first, 0), last) * stride[None, :]
+    near = tl.minimum(tl.maximum(k - first, 0), last) * stride
+    far = tl.minimum(tl.maximum(k + 1 - first, 0), last) * stride
     dense = last >= 0
     return fraction - over, (tl.where(dense, near, k * prime), tl.where(dense, far, (k + 1) * prime))
 
 
 @triton.jit
-def entry(field, x, y, z, live, shape: tl.constexpr):
-    """Where the two features of one corner lie in the table [P, width, 2], and which of them exist."""
-    level = tl.arange(0, shape.width)
+def row_of(field, x, y, z, level, shape: tl.constexpr):
+    """Table rows at levels, from what the places along the three axes add."""
     known = level < shape.levels
     at = field.levels + 8 * level
-    offset = tl.load(at, known, 0)[None, :]
-    mask = tl.load(at + 1, known, 0)[None, :]
-    dense = (tl.load(at + 5, known, 0) > 0)[None, :]
-    row = offset + tl.where(dense, x + y + z, (x ^ y ^ z) & mask)
-    there = live[:, None] & known[None, :]
-    return 2 * row[:, :, None] + tl.arange(0, 2)[None, None, :], there[:, :, None]
+    offset, mask, dense = tl.load(at, known, 0), tl.load(at + 1, known, 0), tl.load(at + 5, known, 0) > 0
+    return offset + tl.where(dense, x + y + z, (x ^ y ^ z) & mask)
 
 
 @triton.jit
 def corner(field, x, y, z, live, shape: tl.constexpr):
     """The two features of one corner at all levels: even [P, width], odd [P, width]."""
-    at, there = entry(field, x, y, z, live, shape)
-    return tl.split(tl.load(field.table + at, there, 0.0))
+    level = tl.arange(0, shape.width)[None, :]
+    at = 2 * row_of(field, x, y, z, level, shape)[:, :, None] + tl.arange(0, 2)[None, None, :]
+    there = live[:, None] & (level < shape.levels)
+    return tl.split(tl.load(field.table + at, there[:, :, None], 0.0))
 
 
 @triton.jit
@@ -153,18 +149,6 @@ def pull(field, at, fraction, d_even, d_odd, live, shape: tl.constexpr):
 
 
 @triton.jit
-def scatter(field, into, at, fraction, d_even, d_odd, live, shape: tl.constexpr):
-    """Add the gradients of both features to the eight corners of the table's gradient ``into``."""
-    fx, fy, fz = fraction
-    both = tl.join(d_even, d_odd)
-    for c in tl.static_range(8):
-        share = (fx if c % 2 else 1 - fx) * (fy if c // 2 % 2 else 1 - fy) * (fz if c // 4 else 1 - fz)
-        place, there = entry(field, at[0][c % 2], at[1][c // 2 % 2], at[2][c // 4], live, shape)
-        there = there & (tl.arange(0, 2) >= 0)[None, None, :]
-        tl.atomic_add(into + place, share[:, :, None] * both, there, sem="relaxed")
-
-
-@triton.jit
 def rise(t):
     """Integral of the quartic kernel from -1 to t."""
     t = tl.minimum(tl.maximum(t, -1.0), 1.0)
@@ -199,9 +183,10 @@ def one_blob(phase, shape: tl.constexpr):
 
 @triton.jit
 def place(field, x, rest, shape: tl.constexpr):
-    """Points at distances from the anchor and what rounding lost (x, y, z: [P] each): what their corners add to row
-    numbers, and fractions within the cells."""
-    fx, at_x = locate(field, x[0], rest[0], 0, 1, shape)
-    fy, at_y = locate(field, x[1], rest[1], 1, PRIME_Y, shape)
-    fz, at_z = locate(field, x[2], rest[2], 2, PRIME_Z, shape)
+    """Points at distances from the anchor and what rounding lost (x, y, z: [P] each), at all levels [P, width]: what
+    their corners add to row numbers, and fractions within the cells."""
+    level = tl.arange(0, shape.width)[None, :]
+    fx, at_x = locate(field, x[0][:, None], rest[0][:, None], level, 0, 1, shape)
+    fy, at_y = locate(field, x[1][:, None], rest[1][:, None], level, 1, PRIME_Y, shape)
+    fz, at_z = locate(field, x[2][:, None], rest[2][:, None], level, 2, PRIME_Z, shape)
     return (at_x, at_y, at_z), (fx, fy, fz)

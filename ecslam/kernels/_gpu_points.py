@@ -25,7 +25,7 @@ from ._gpu_decoders import (
     product,
     through_blob,
 )
-from ._gpu_field import gather, on_box, one_blob, place, scatter
+from ._gpu_field import gather, on_box, one_blob, place
 
 
 class Points(NamedTuple):
@@ -224,61 +224,3 @@ def weights_kernel(placed, total, features_at, d_hidden_at, into, blocks, shape:
         by_blob += product(tl.trans(blob), d_hidden)
     add_rows(into.w_in, feature_rows(shape), by_feature)
     add_rows(into.w_in, blob_rows(shape), by_blob)
-
-
-@triton.jit
-def add_poses(d_c2w, live, local, pose, gradient):
-    """Add a block's share to the gradients [P, 3, 4] of its poses. Poses ascend, so a block meets few of them."""
-    first, last = tl.min(tl.where(live, pose, 2147483647)), tl.max(tl.where(live, pose, -1))
-    axis = tl.arange(0, 4)[None, :]
-    gx, gy, gz = gradient[0][:, None], gradient[1][:, None], gradient[2][:, None]
-    up = tl.where(axis == 0, gx, tl.where(axis == 1, gy, tl.where(axis == 2, gz, 0.0)))
-    x, y, z = local[0].to(tl.float32)[:, None], local[1].to(tl.float32)[:, None], local[2].to(tl.float32)[:, None]
-    lever = tl.where(axis == 0, x, tl.where(axis == 1, y, tl.where(axis == 2, z, 1.0)))
-    entries = up[:, :, None] * lever[:, None, :]
-    row, column = tl.arange(0, 4)[:, None], tl.arange(0, 4)[None, :]
-    for p in range(first, last + 1):
-        mine = (live & (pose == p))[:, None, None]
-        total = tl.sum(tl.where(mine, entries, 0.0), 0)
-        tl.atomic_add(d_c2w + 12 * p + 4 * row + column, total, (row < 3) & (column >= 0), sem="relaxed")
-
-
-@triton.jit
-def slid(field, slopes_at, i, live, total, d_even, d_odd, axis: tl.constexpr, shape: tl.constexpr):
-    """Gradient by one world coordinate through the grid features, per metre [P], from theirs [P, width]."""
-    level, further = tl.arange(0, shape.width), shape.levels * total
-    where, there = level_places(i, live, total, shape)
-    inverse = tl.load(field.inverse + 2 * level, level < shape.levels, 0.0)[None, :]
-    even = tl.load(slopes_at + axis * further + where, there, 0.0)
-    odd = tl.load(slopes_at + (3 + axis) * further + where, there, 0.0)
-    return tl.sum((d_even * even + d_odd * odd) * inverse, 1)
-
-
-@triton.jit(do_not_specialize=["total"])
-def grid_kernel(
-    field, points, placed, total, d_features_at, slopes_at, d_world, into, d_c2w, want_params: tl.constexpr,
-    want_poses: tl.constexpr, shape: tl.constexpr, block: tl.constexpr,
-):  # fmt: skip
-    """From the gradients of the grid features [2, L, N] to the table and, with their derivatives [2, 3, L, N] and the
-    one-blob part of the position's gradient d_world [N, 3], to the poses."""
-    i = tl.program_id(0) * block + tl.arange(0, block)
-    live = i < total
-    where, there = level_places(i, live, total, shape)
-    d_even = tl.load(d_features_at + where, there, 0.0)
-    d_odd = tl.load(d_features_at + shape.levels * total + where, there, 0.0)
-    if want_params:
-        x, rest = load_placed(placed, 0, i, live, total), load_placed(placed, 1, i, live, total)
-        at, fraction = place(field, x, rest, shape)
-        scatter(field, into.table, at, fraction, d_even, d_odd, live, shape)
-    if want_poses:
-        inside = load_placed(placed, 3, i, live, total)
-        gx = slid(field, slopes_at, i, live, total, d_even, d_odd, 0, shape)
-        gy = slid(field, slopes_at, i, live, total, d_even, d_odd, 1, shape)
-        gz = slid(field, slopes_at, i, live, total, d_even, d_odd, 2, shape)
-        gradient = (
-            (gx + tl.load(d_world + 3 * i, live, 0.0)) * inside[0],
-            (gy + tl.load(d_world + 3 * i + 1, live, 0.0)) * inside[1],
-            (gz + tl.load(d_world + 3 * i + 2, live, 0.0)) * inside[2],
-        )
-        local, pose = sample(points, i, live)
-        add_poses(d_c2w, live, local, pose, gradient)

@@ -36,7 +36,8 @@ if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
 from ._gpu_align import SUMS, align_kernel, gradients_kernel
 from ._gpu_device import beside, processors
 from ._gpu_field import Field, Shape
-from ._gpu_points import Into, Points, decoders_kernel, grid_kernel, place_kernel, values_kernel, weights_kernel
+from ._gpu_grid import grid_kernel
+from ._gpu_points import Into, Points, decoders_kernel, place_kernel, values_kernel, weights_kernel
 from ._gpu_rays import Targets, losses_kernel, render_kernel
 from .adam_gpu import map_step as map_step
 from .depths_gpu import importance_depths as importance_depths
@@ -49,7 +50,8 @@ VALUES_REGISTERS = 168  # a thread; so that three programs share a processor
 DECODERS_BLOCK, DECODERS_WARPS = 64, 4  # as for the values
 DECODERS_REGISTERS = 168  # for poses alone, likewise; with 168 the way to the weights would spill
 WEIGHTS_BLOCK, WEIGHTS_WARPS = 64, 4  # as for the values
-GRID_BLOCK, GRID_WARPS = 32, 4  # no products; timed against 8 warps and 64 points on an H200
+GRID_BLOCK, GRID_WARPS = 32, 4  # to the poses; timed against 8 warps and 64 points on an H200
+TABLE_RUN, TABLE_LANES, TABLE_WARPS = 4, 32, 8  # to the table: points that a lane adds up; a warp's lanes; for either
 ALIGN_BLOCK, ALIGN_WARPS = 32, 4  # the gradients in space spill registers, and with 64 points far more
 PLACE_BLOCK = 128  # one point a thread
 RAY_ELEMENTS = 512  # padded samples that one program renders
@@ -251,10 +253,12 @@ def _step(
             placed, total, features, hidden, sink, blocks, shape=shape, block=WEIGHTS_BLOCK, num_warps=WEIGHTS_WARPS
         )
     unused = losses
-    grid_kernel[(_blocks(total, GRID_BLOCK),)](
-        field, points, placed, total, d_features, unused if slopes is None else slopes, d_world, sink,
-        unused if d_c2w is None else d_c2w,
-        **wanted, shape=shape, block=GRID_BLOCK, num_warps=GRID_WARPS,
+    of_table = 0 if into is None else _blocks(total, TABLE_RUN * TABLE_LANES // 2)
+    of_poses = 0 if d_c2w is None else _blocks(total, GRID_BLOCK)
+    grid_kernel[(of_table + of_poses,)](
+        field, points, placed, total, of_table, d_features, unused if slopes is None else slopes, d_world, sink,
+        unused if d_c2w is None else d_c2w, **wanted, run=TABLE_RUN, lanes=TABLE_LANES, shape=shape, block=GRID_BLOCK,
+        num_warps=GRID_WARPS if into is None else TABLE_WARPS,
     )  # fmt: skip
 
 
