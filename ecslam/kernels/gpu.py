@@ -34,6 +34,7 @@ if not torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") != "1":
     raise ImportError("no CUDA device")
 
 from ._gpu_align import SUMS, align_kernel, gradients_kernel
+from ._gpu_clear import clear_kernel
 from ._gpu_device import beside, processors
 from ._gpu_field import Field, Shape
 from ._gpu_grid import grid_kernel
@@ -54,6 +55,7 @@ GRID_BLOCK, GRID_WARPS = 32, 4  # to the poses; timed against 8 warps and 64 poi
 TABLE_RUN, TABLE_LANES, TABLE_WARPS = 4, 32, 8  # to the table: points that a lane adds up; a warp's lanes; for either
 ALIGN_BLOCK, ALIGN_WARPS = 32, 4  # the gradients in space spill registers, and with 64 points far more
 PLACE_BLOCK = 128  # one point a thread
+CLEAR_BLOCK = 1024  # numbers
 RAY_ELEMENTS = 512  # padded samples that one program renders
 PROGRAMS_A_PROCESSOR = 2
 
@@ -121,6 +123,11 @@ def _targets(rays: RayBatch) -> Targets:
 
 def _blocks(count: int, block: int) -> int:
     return -(-count // block)
+
+
+def _clear(tensors: list[Tensor]) -> None:
+    sizes = tuple(tensor.numel() for tensor in tensors)
+    clear_kernel[(_blocks(max(sizes), CLEAR_BLOCK),)](tuple(tensors), sizes, block=CLEAR_BLOCK)
 
 
 def _ray_grid(rays: int, samples: int) -> tuple[tuple[int], dict[str, int]]:
@@ -207,7 +214,7 @@ def step(
     losses, d_c2w = out[:5], out[5:].view(poses, 3, 4)
     learnt = [] if into is None else [into.table, into.w_in, into.w_sdf, into.w_rgb, into.beta]
     with beside(out):
-        torch._foreach_zero_([out, *learnt])
+        _clear([out, *learnt])
         if targets.z.numel():
             _step(layout, params, _samples(c2w, rays), targets, weights, into, losses, d_c2w if want_poses else None)
     if into is not None and adam is not None:
