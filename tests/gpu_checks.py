@@ -101,6 +101,13 @@ def test_the_block_that_runs_on_a_gpu(monkeypatch):
     assert_step(make_field(), *make_rays(gpu.GRID_BLOCK + 1, 2))
 
 
+@pytest.mark.parametrize(("run", "lanes"), [(1, 64), (2, 32), (8, 32)])
+def test_any_number_of_points_may_be_added_up(monkeypatch, run, lanes):
+    monkeypatch.setattr(gpu, "TABLE_RUN", run)
+    monkeypatch.setattr(gpu, "TABLE_LANES", lanes)
+    assert_step(make_field(), *make_rays(7, 19), want_poses=False)
+
+
 @pytest.mark.parametrize(("count", "samples"), [(3, 43), (70, 1)])
 def test_step_and_render_with_other_numbers_of_samples(count, samples):
     c2w, rays = make_rays(count, samples)
