@@ -59,7 +59,7 @@ class Since:
 
     def __init__(self, device: torch.device) -> None:
         self._took_s, self._began_s = 0.0, time.perf_counter()
-        self._marks = [_mark()] if device.type == "cuda" else []
+        self._marks = [_mark(device)] if device.type == "cuda" else []
 
     def bring(self, result: Tensor) -> Tensor:
         """The ``result`` on the host, where it will have arrived when the work is ``done``."""
@@ -67,7 +67,7 @@ class Since:
             self._took_s = time.perf_counter() - self._began_s
             return result.cpu()
         here = torch.empty(result.shape, dtype=result.dtype, pin_memory=True).copy_(result, non_blocking=True)
-        self._marks.append(_mark())
+        self._marks.append(_mark(result.device))
         return here
 
     def done(self) -> bool:
@@ -83,7 +83,7 @@ class Since:
         return 1e-3 * began.elapsed_time(ended)
 
 
-def _mark() -> torch.cuda.Event:
+def _mark(device: torch.device) -> torch.cuda.Event:
     event = torch.cuda.Event(enable_timing=True)
-    event.record()
+    event.record(torch.cuda.current_stream(device))
     return event
