@@ -8,7 +8,11 @@ import torch
 
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
+from ecslam.datasets.slots import RESTING, Slots
+from ecslam.pixels_gpu import DeviceFrame
+from ecslam.runtime.readers import page_lock
 from ecslam.slam import Slam
+from ecslam.types import Frame, Intrinsics
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
 FRAMES = 40
@@ -47,3 +51,33 @@ def test_a_run_replays_its_loops_and_follows_the_camera(frames, preset, schedule
     assert replays(mapping) >= 2
     off = slam.trajectory.poses()[:, :3, 3] - np.stack([frame.c2w_gt[:3, 3] for frame in seen])
     assert np.sqrt(np.square(off).sum(1).mean()) < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["live", "lite"])
+def test_loops_are_recorded_again_where_the_map_grows(preset):
+    room = open_sequence("synthetic/studio?size=320x240&frames=100")
+    config = apply_settings(load_preset(preset), ["mapping.final_iterations=30"])
+    slam = Slam(config, room.intrinsics, device=torch.device("cuda"), first_pose=room[0].c2w_gt)
+    rows = set()
+    for i in range(FRAMES):
+        slam.step(room[i])
+        rows.add(len(slam.mapper.field.params.table))
+    slam.finish()
+    assert len(rows) > 1
+    assert (slam._follower.recorder.failure, slam.mapper.recorder.failure) == ("", "")
+    off = slam.trajectory.poses()[:, :3, 3] - np.stack([room[i].c2w_gt[:3, 3] for i in range(FRAMES)])
+    assert np.sqrt(np.square(off).sum(1).mean()) < 0.02
+
+
+def test_a_gpu_fetches_from_slots_by_itself():
+    camera = Intrinsics(100, 100, 79.5, 59.5, 160, 120)
+    slots, rng = Slots(camera, RESTING + 2), np.random.default_rng(0)
+    page_lock("cuda", slots)
+    color, depth = rng.integers(0, 255, (120, 160, 3), np.uint8), rng.random((120, 160), np.float32)
+    slot = slots.take()
+    frame = slots.found(slots.put(Frame(0, 0.0, color, depth), slot), slot)
+    assert torch.from_numpy(frame.depth).is_pinned()
+    shown = DeviceFrame.of(frame, torch.device("cuda"))
+    assert np.array_equal(shown.color.cpu(), color)
+    assert np.array_equal(shown.depth.cpu(), depth)
