@@ -70,7 +70,8 @@ def _tensors(params: FieldParams) -> list[Tensor]:
 
 @dataclass(frozen=True)
 class Job:
-    """What all iterations of a run have in common. move: whether any pose does. smooth, settle: see ``Mapper.run``."""
+    """What all iterations of a mapping have in common. move: whether any pose does. smooth, settle: see
+    ``Mapper.begin``."""
 
     config: Config
     move: bool
@@ -109,24 +110,6 @@ class Mapper:
         self._bank, self._spare = PixelBank(field.device), [torch.zeros(0)]
         self._desk, self._box = Desk(0, 0, field.device), field.layout.box.to(field.device)
 
-    def run(
-        self,
-        views: Sequence[Pixels],
-        c2w: NDArray[np.float64],
-        fixed: NDArray[np.bool_],
-        iterations: int,
-        config: Config,
-        interrupt: Callable[[], None] | None = None,
-        smooth: bool = False,
-        settle: bool = False,
-    ) -> MapResult:
-        """Optimise the map and the poses c2w [W, 4, 4] of the views where not ``fixed`` [W].
-
-        Every iteration draws its rays from the stored pixels and transforms them by the current poses. smooth: with the
-        smoothness term. settle: the map's learning rates fade to none, as those of the poses always do.
-        """
-        return self.begin(views, c2w, fixed, iterations, config, interrupt, smooth, settle).result()
-
     def begin(
         self,
         views: Sequence[Pixels],
@@ -138,8 +121,13 @@ class Mapper:
         smooth: bool = False,
         settle: bool = False,
     ) -> Mapping:
-        """``run``, which on a GPU is only on its way when this returns. One at a time. Where it comes to nothing, all
-        is put back when its result is asked for."""
+        """Optimise the map and the poses c2w [W, 4, 4] of the views where not ``fixed`` [W]. On a GPU that is only on
+        its way when this returns; one at a time. Where it comes to nothing, all is put back when its result is asked
+        for.
+
+        Every iteration draws its rays from the stored pixels and transforms them by the current poses. smooth: with the
+        smoothness term. settle: the map's learning rates fade to none, as those of the poses always do.
+        """
         since, before = Since(self.field.device), self._backup()
         job = Job(config, bool(not fixed.all()), smooth, settle)
         interrupt = interrupt or (lambda: None)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from . import kernels as seam
+from .beside import Beside, Mapped
 from .config import Config
 from .denoising import denoised
 from .field import TsdfField, create_field
@@ -27,7 +27,7 @@ from .kernels.denormals import flushed
 from .kernels.graphs import Recorder
 from .keyframes import Keyframe, Shelf, make_keyframe, surface_points
 from .loops import LoopDetector, loop_event
-from .mapper import Mapper, Mapping, MapResult
+from .mapper import Mapper, Mapping
 from .messages import MOVING, LoopEvent, StepReport
 from .rigid import is_rigid, orthonormalise
 from .saving import Arrays, pack_keyframes, pack_random, part, prefixed, unpack_keyframes, unpack_random
@@ -41,22 +41,6 @@ from .window import random_window, select_window
 Interrupt = Callable[[], None]
 LEAST_SHARE = 0.1
 SETTLE_RAYS = 4  # at least so many for each keyframe in an iteration
-
-
-@dataclass(frozen=True)
-class Mapped:
-    """A mapping that is done. window: rows [W] of the keyframes that took part."""
-
-    window: NDArray[np.int64]
-    result: MapResult
-
-
-@dataclass(frozen=True)
-class Pending:
-    """A mapping that goes on beside tracking; see ``Mapped``."""
-
-    window: NDArray[np.int64]
-    coming: Future[MapResult] | Mapping
 
 
 @dataclass(frozen=True)
@@ -101,11 +85,8 @@ class Slam:
             config, intrinsics, self.device, self.kernels_name, self._kernels, self._rng, self._generator
         )
         self._loops = LoopDetector()
-        on_gpu = self.device.type == "cuda"
-        self._beside = config.schedule == "overlap" or (config.schedule == "auto" and on_gpu)
-        self._pool = ThreadPoolExecutor(1, "mapper") if self._beside and not on_gpu else None
-        self._stream = torch.cuda.Stream(self.device) if self._beside and on_gpu else None
-        self._pending: Pending | None = None
+        overlap = config.schedule == "overlap" or (config.schedule == "auto" and self.device.type == "cuda")
+        self._beside = Beside(self.device) if overlap else None
         self._landed = Landed()
         self._frozen: TsdfField | None = None
         self._note, self._graphs_failed, self._moving = "", False, False
@@ -207,9 +188,9 @@ class Slam:
         keyframes (ours); call it once, at the end. Raises whatever ``interrupt`` raises; no pose has moved then, or
         all have come to rest."""
         self._apply_pending(block=True)
-        if self._pool is not None:
-            self._pool.shutdown()
-        self._beside, self._pool, self._stream = False, None, None
+        if self._beside is not None:
+            self._beside.close()
+            self._beside = None
         if self.mapper is not None and not self._follower.recovery.lost:
             self._apply(self._optimise(self._choose_window(), self.config.mapping.iterations, interrupt, smooth=True))
             self._settle(interrupt)
@@ -221,7 +202,7 @@ class Slam:
         rows = evenly(len(self.keyframes), mapping.rays // SETTLE_RAYS)
         views, poses = [self.keyframes[i].pixels for i in rows], self.trajectory.keyframe_poses()[rows]
         fixed, config = np.ones(len(rows), bool), replace(self.config, mapping=mapping)
-        self.mapper.run(views, poses, fixed, mapping.final_iterations, config, interrupt, settle=True)
+        self.mapper.begin(views, poses, fixed, mapping.final_iterations, config, interrupt, settle=True).result()
 
     # ---- mapping ----------------------------------------------------------------------------------------------------
 
@@ -231,8 +212,8 @@ class Slam:
         self._check_box()
         window, iterations = self._choose_window(), self.config.mapping.iterations
         old = self._loops.update(self.trajectory.keyframe_poses(), self.trajectory[-1])
-        if self._beside and len(old) == 0:
-            self._pending = Pending(window, self._begin_beside(window, iterations))
+        if self._beside is not None and len(old) == 0:
+            self._beside.begin(window, partial(self._begin, window, iterations))
             return None
         before = self.trajectory.poses() if len(old) else None
         mapped = self._optimise(window, iterations, interrupt)
@@ -276,14 +257,6 @@ class Slam:
         poses = self.trajectory.keyframe_poses()[window]
         return self.mapper.begin(views, poses, window == 0, iterations, self.config, interrupt, smooth)
 
-    def _begin_beside(self, window: NDArray[np.int64], iterations: int) -> Future[MapResult] | Mapping:
-        if self._pool is not None:
-            return self._pool.submit(lambda: self._begin(window, iterations).result())
-        assert self._stream is not None
-        self._stream.wait_stream(torch.cuda.current_stream(self.device))
-        with torch.cuda.stream(self._stream):
-            return self._begin(window, iterations)
-
     def _apply(self, mapped: Mapped, beside_s: float = 0.0) -> None:
         window, result = mapped.window, mapped.result
         frames = tuple(self.keyframes[i].frame for i in window)
@@ -297,17 +270,16 @@ class Slam:
 
     def _apply_pending(self, block: bool) -> float:
         """Apply what was made beside tracking; the seconds that were waited for it."""
-        if self._pending is None or not (block or self._pending.coming.done()):
+        taken = self._beside.take(block) if self._beside is not None else None
+        if taken is None:
             return 0.0
-        began, pending, self._pending = time.perf_counter(), self._pending, None
-        result = pending.coming.result()
-        waited_s = time.perf_counter() - began
-        self._apply(Mapped(pending.window, result), result.took_s)
+        mapped, waited_s = taken
+        self._apply(mapped, mapped.result.took_s)
         return waited_s
 
     def _tracking_field(self) -> TsdfField:
         assert self.mapper is not None
-        return self.mapper.field.freeze(self._frozen) if self._beside else self.mapper.field
+        return self.mapper.field if self._beside is None else self.mapper.field.freeze(self._frozen)
 
     def _new_recorder(self) -> Recorder:
         return Recorder(plain=self.kernels_name != "gpu")

@@ -63,7 +63,7 @@ def test_a_map_drawn_on_the_device_is_as_good_as_one_drawn_by_numpy(room, config
     views, poses = keyframes(room, config, holes)
     fixed = np.ones(3, bool)
     host, device = mapper(room, config), mapper(room, config)
-    expected = host.run(views, poses, fixed, 60, config)
+    expected = host.begin(views, poses, fixed, 60, config).result()
     job = Job(config, move=False, smooth=False, settle=False)
     _, losses, sound = device._on_device(job, views, poses, fixed, 60, lambda: None)
     assert losses.shape == (60, 5)
@@ -83,12 +83,12 @@ def test_poses_move_on_the_device_as_they_do_on_the_host(room):
     errors = []
     for on_device in (False, True):
         one = mapper(room, config)
-        one.run(views, poses, np.ones(3, bool), 150, config)
+        one.begin(views, poses, np.ones(3, bool), 150, config).result()
         job = Job(config, move=True, smooth=False, settle=False)
         if on_device:
             moved = one._on_device(job, views, off, fixed, 40, lambda: None)[0].numpy()
         else:
-            moved = one.run(views, off, fixed, 40, config).c2w
+            moved = one.begin(views, off, fixed, 40, config).result().c2w
         assert moved.shape == (3, 4, 4)
         assert np.array_equal(moved[:2], poses[:2])
         errors.append(float(np.linalg.norm(moved[2, :3, 3] - poses[2, :3, 3])))
@@ -132,7 +132,7 @@ def test_a_loop_that_follows_growth_is_recorded_again(room, config):
 def test_tracking_is_the_same_recorded_and_plain(room, config):
     views, poses = keyframes(room, config)
     one = mapper(room, config)
-    one.run(views, poses, np.ones(3, bool), 100, config)
+    one.begin(views, poses, np.ones(3, bool), 100, config).result()
     graphs, found = FakeGraphs(), []
     for recorder in (Recorder(plain=True), Recorder(capture=graphs.capture)):
         generator = torch.Generator().manual_seed(0)
@@ -151,7 +151,7 @@ def test_tracking_is_the_same_recorded_and_plain(room, config):
 def test_steps_are_longer_where_no_alignment_came_before(room, config):
     views, poses = keyframes(room, config)
     one = mapper(room, config)
-    one.run(views, poses, np.ones(3, bool), 100, config)
+    one.begin(views, poses, np.ones(3, bool), 100, config).result()
     pixels = choose_pixels(room[1], room.intrinsics, 300, config, np.random.default_rng(0))
     guess = np.array(room[1].c2w_gt)
     guess[:3, 3] += 0.03

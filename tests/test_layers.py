@@ -53,6 +53,7 @@ LAYERS = (
         "meshing_table",
         "evaluation",
     ),
+    ("beside",),
     ("slam",),
     ("selfcalibration", "cameras"),
     ("runtime",),
