@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .kernels import earlier_views
-from .rigid import inverse
 from .types import Frame, Intrinsics
 
 COLUMNS, SAMPLES = 64, 4  # cells in a row of the image, and pixels of a cell's row or column whose depth is looked at
@@ -88,7 +87,9 @@ def cell_lens(camera: Intrinsics, cell: int) -> NDArray[np.float32]:
 
 def to_views(c2w: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float32]:
     """Motions [V, 3, 4] from the coordinates of a camera at c2w [4, 4] to those of views from ``poses`` [V, 4, 4]."""
-    return (inverse(poses) @ c2w)[:, :3].astype(np.float32)
+    out = np.empty((len(poses), 3, 4), np.float32)
+    earlier_views.to_views(c2w, poses, out)
+    return out
 
 
 def relief(depth: NDArray[np.float32]) -> Cells:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ecslam.datasets import open_sequence
-from ecslam.earlier import SAMPLES, around, cell_lens, cell_px, light, relief
+from ecslam.earlier import SAMPLES, around, cell_lens, cell_px, light, relief, to_views
 from ecslam.exposure import WITHIN
 from ecslam.kernels import earlier_views
 from ecslam.movers import FRONT, compare
@@ -109,3 +109,10 @@ def test_ratios_are_those_of_the_cells_that_see_the_same(every, stride):
     assert found > 300 / stride**2
     some = (0.1, 0.5, 0.9)
     assert np.quantile(out[:found], some) == pytest.approx(np.quantile(expected, some), abs=5e-3)
+
+
+def test_motions_to_views_are_those_of_numpy():
+    poses = np.stack([ROOM[i].c2w_gt for i in range(0, 72, 8)])
+    expected = (inverse(poses) @ ROOM[73].c2w_gt)[:, :3]
+    np.testing.assert_allclose(to_views(ROOM[73].c2w_gt, poses), expected, rtol=0, atol=1e-6)
+    assert to_views(ROOM[73].c2w_gt, poses[:0]).shape == (0, 3, 4)

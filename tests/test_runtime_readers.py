@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 
@@ -234,3 +235,33 @@ def test_a_run_is_the_same_whoever_reads(folder, tmp_path, monkeypatch):
         paths.append((tmp_path / str(by_processes) / "trajectory.txt").read_bytes())
     assert paths[0] == paths[1]
     assert paths[0].count(b"\n") >= 29
+
+
+@pytest.mark.parametrize("locked", [True, False])
+def test_memory_is_locked_for_a_gpu_until_nothing_holds_a_frame(locked, monkeypatch):
+    done = []
+
+    class Runtime:
+        def cudaHostRegister(self, pointer, size, flags):
+            done.append(("lock", pointer, size))
+            return 0 if locked else 1
+
+        def cudaHostUnregister(self, pointer):
+            done.append(("unlock", pointer))
+
+    monkeypatch.setattr(torch.cuda, "cudart", Runtime)
+    monkeypatch.setattr(torch.cuda, "device", lambda index: nullcontext())
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: done.append("wait"))
+    slots = Slots(CAMERA, RESTING + 1)
+    readers.page_lock("cuda:1", slots)
+    slot, depth = slots.take(), np.ones((120, 160), np.float32)
+    held = slots.found(slots.put(Frame(0, 0.0, np.zeros((120, 160, 3), np.uint8), depth), slot), slot).depth[5:]
+    first, memory = done[0], len(slots.memory)
+    del slots
+    gc.collect()
+    assert done == [first]
+    assert held.min() == 1
+    del held
+    gc.collect()
+    assert done == ([first, "wait", ("unlock", first[1])] if locked else [first])
+    assert first[2] == memory

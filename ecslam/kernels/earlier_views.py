@@ -32,6 +32,20 @@ def nearest(depth, cell, inside, out):
             least[column] = least[column] if measured[column] > enough else zero
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def to_views(c2w, poses, out):
+    """Motions ``out`` float32 [V, 3, 4] from the coordinates of a camera at c2w float64 [4, 4] to those of views from
+    ``poses`` float64 [V, 4, 4]."""
+    for view in range(poses.shape[0]):
+        pose = poses[view]
+        for i in range(3):
+            for j in range(4):
+                moved = 0.0
+                for k in range(3):
+                    moved += pose[k, i] * (c2w[k, j] - (pose[k, 3] if j == 3 else 0.0))
+                out[view, i, j] = moved
+
+
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def project(depths, v, lens, to_view, rows, index, ahead):
     """Where a view [rows, columns] sees the cells of row ``v``: flat ``index``, -1 outside, and the depth ``ahead``."""
