@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,14 +21,14 @@ from .keyframes import Keyframe
 from .movers import without_movers
 from .observed import ObservedVoxels
 from .observed_gpu import ObservedTable
-from .recovery import SUDDEN_DEG, SUDDEN_M, Recovery, around, best_start, near
+from .recovery import SUDDEN_DEG, SUDDEN_M, Recovery, around, near
 from .relocalisation import Relocalisation
 from .samples import seeded
 from .saving import Arrays, part, prefixed
 from .shutter import STILL, Sweep, sweep_between
 from .tracker import HostTracker, Tracker, TrackResult
 from .trajectory import Trajectory
-from .types import Frame, Intrinsics
+from .types import Frame, FrameError, Intrinsics
 from .volume import FusedVolume, create_volume
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ class Follower:
             self._observed = table = ObservedTable(device)
             self._gpu_tracker = self._on_gpu(table, seeded(rng, device))
         self._trusted = 0
+        self._ahead: tuple[Frame, Frame, Frame] | None = None
 
     def _on_gpu(self, observed: ObservedTable, generator: torch.Generator) -> GpuTracker:
         from .tracker_gpu import GpuTracker
@@ -85,6 +87,17 @@ class Follower:
         gap = frame.timestamp - trajectory.timestamps[-1] > GAP_S
         known = not (gap or self.recovery.lost)
         return Expected(trajectory.predict(frame.timestamp) if known else trajectory[-1], known, gap)
+
+    def looked_at(
+        self, frame: Frame, expected: Expected, trajectory: Trajectory, config: Config
+    ) -> tuple[Frame, Frame]:
+        """The frame as it is ``exposed``, and what of it is ``still``; this has been found already if it was announced
+        while the one before was tracked."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and ahead[0] is frame and expected.known:
+            return ahead[1:]
+        seen = self.exposed(frame, expected, trajectory, config)
+        return seen, self.still(seen, expected, trajectory, config)
 
     def exposed(self, frame: Frame, expected: Expected, trajectory: Trajectory, config: Config) -> Frame:
         """The frame with the gain that makes it as bright as if it were exposed as the first one, as the fused volume
@@ -117,15 +130,24 @@ class Follower:
         keyframes: list[Keyframe],
         field: TsdfField,
         config: Config,
+        then: Frame | None = None,
     ) -> TrackResult:
         """The pose of the frame after ``trajectory``: the preset's tracker on ``field``, starting where it is expected,
-        and recovery when the map does not explain the frame, which then says whether it is only the last pose again."""
+        and recovery when the map does not explain the frame, which then says whether it is only the last pose again.
+        then: the next frame, to look at while a GPU tracks this one."""
         if config.tracking.iterations > 0 or self._volume is None:
             self._observe(trajectory, keyframes)
         surface, tracker = self._tracker(field, config)
         sweep = self.sweep(trajectory, config) if expected.known else STILL
         starts = around(expected.c2w) if expected.gap else [expected.c2w]
-        track = best_start(lambda start: tracker.track(frame, start, field, config, sweep), starts)
+        tracking = tracker.begin(frame, starts[0], field, config, sweep)
+        if then is not None and self._gpu_tracker is not None:
+            with suppress(FrameError):  # that is for when its turn comes
+                then.require_fit(self._camera)
+                soon = Expected(trajectory.predict(then.timestamp), True, False)
+                self._ahead = (then, *self.looked_at(then, soon, trajectory, config))
+        others = (tracker.begin(frame, start, field, config, sweep).result() for start in starts[1:])
+        track = max([tracking.result(), *others], key=lambda result: result.fit)
         elsewhere = Relocalisation(frame, self._camera, surface, trajectory, keyframes, config, self._rng)
         return self.recovery.judge(track, trajectory[-1], elsewhere, expected.gap)
 

@@ -94,9 +94,9 @@ class Slam:
     # ---- one frame --------------------------------------------------------------------------------------------------
 
     @flushed()
-    def step(self, frame: Frame, interrupt: Interrupt | None = None) -> StepReport:
-        """Track the frame; every n-th frame, map. Raises FrameError for one that is not of this camera, and whatever
-        ``interrupt`` raises, called inside long loops."""
+    def step(self, frame: Frame, interrupt: Interrupt | None = None, then: Frame | None = None) -> StepReport:
+        """Track the frame; every n-th frame, map. then: the next frame, where it is known already. Raises FrameError
+        for one that is not of this camera, and whatever ``interrupt`` raises, called inside long loops."""
         frame.require_fit(self.intrinsics)
         frame = denoised(frame, self.config)
         if self.mapper is None:
@@ -104,13 +104,12 @@ class Slam:
         started = time.perf_counter()
         self._apply_pending(block=False)
         expected = self._follower.expected(frame, self.trajectory)
-        frame = self._follower.exposed(frame, expected, self.trajectory, self.config)
-        seen, frame = frame, self._follower.still(frame, expected, self.trajectory, self.config)
+        seen, frame = self._follower.looked_at(frame, expected, self.trajectory, self.config)
         if frame is not seen and not self._moving:
             self._note = MOVING
         self._moving = frame is not seen
         given = self.trajectory, self.keyframes, self._require_field(), self.config
-        track = self._follower.follow(frame, expected, *given)
+        track = self._follower.follow(frame, expected, *given, then)
         index, recovery = len(self.trajectory), self._follower.recovery
         keyframe = index % self.config.keyframe_every == 0 and not recovery.missed
         self.trajectory.append(track.c2w, frame.timestamp, keyframe)

@@ -39,14 +39,34 @@ class TrackResult:
     fit: float
 
 
+class Tracking(Protocol):
+    """A frame that is being tracked."""
+
+    def result(self) -> TrackResult:
+        """What came of it; waits for it."""
+        ...
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """``Tracking`` that is done."""
+
+    found: TrackResult
+
+    def result(self) -> TrackResult:
+        """See ``Tracking``."""
+        return self.found
+
+
 class Tracker(Protocol):
     """Follows the camera from frame to frame."""
 
-    def track(
+    def begin(
         self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep = STILL
-    ) -> TrackResult:
-        """The pose of a frame, sought from ``guess`` [4, 4], that was read during ``sweep`` (see ``shutter``);
-        ``guess`` itself with a fit of 0 where hardly anything is measured."""
+    ) -> Tracking:
+        """Seek the pose of a frame from ``guess`` [4, 4], that was read during ``sweep`` (see ``shutter``); the result
+        is ``guess`` itself with a fit of 0 where hardly anything is measured. One at a time; on a GPU that is only on
+        its way when this returns."""
         ...
 
 
@@ -64,10 +84,16 @@ class HostTracker:
     generator: torch.Generator | None
     recorder: Recorder
 
-    def track(
+    def begin(
         self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep = STILL
+    ) -> Tracked:
+        """See ``Tracker``."""
+        return Tracked(self._track(frame, guess, field, config, sweep))
+
+    def _track(
+        self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep
     ) -> TrackResult:
-        """See ``Tracker``. Direct alignment of points spread over the image, then the paper's rendered tracking; the
+        """Direct alignment of points spread over the image, then the paper's rendered tracking; the
         preset may leave either out. A rendered pose is taken where it costs ``SURELY`` less on the aligned surface."""
         surface, measured = self.surface, spread_pixels(frame, self.camera, config.align.points, config, self.rng)
         measured = straight_pixels(measured, self.camera, sweep)

@@ -1,4 +1,4 @@
-"""Tracking a frame on a GPU: one upload, one recorded graph, one wait, for its result.
+"""Tracking a frame on a GPU: one upload, one recorded graph, and one wait, when its result is asked for.
 
 The same steps as ``tracker.track_frame`` takes on the host, in fixed sizes: points are spread over the image and
 aligned to the fused volume, then the paper's rendered tracking, where the preset has it, goes on from there.
@@ -37,6 +37,24 @@ from .volume_gpu import GpuVolume
 HEAD = 24
 
 
+@dataclass(frozen=True)
+class GpuTracking:
+    """``Tracking`` from ``guess`` [4, 4]. found: what ``GpuTracker._whole`` makes of the frame, on the device."""
+
+    guess: NDArray[np.float64]
+    found: Tensor
+    rendered: bool
+
+    def result(self) -> TrackResult:
+        """See ``Tracking``."""
+        told = self.found.cpu().numpy()
+        pose, (cost, fit, usable), terms = told[:12], told[12:TOLD].tolist(), told[TOLD:]
+        if usable < LEAST_POINTS:
+            return TrackResult(self.guess, {}, 0.0)
+        named = dict(zip(LOSS_NAMES, terms.tolist(), strict=True)) if self.rendered else {"align_mm": 1e3 * cost**0.5}
+        return TrackResult(np.concatenate([pose.reshape(3, 4), self.guess[3:]]), named, fit)
+
+
 @dataclass
 class GpuTracker:
     """What tracking reads. volume: what frames are aligned to. observed: where the map may be trusted. generator: on
@@ -51,9 +69,9 @@ class GpuTracker:
     _dice: Dice | None = own(default=None, init=False)
     _letter: Letter | None = own(default=None, init=False)
 
-    def track(
+    def begin(
         self, frame: Frame, guess: NDArray[np.float64], field: TsdfField, config: Config, sweep: Sweep = STILL
-    ) -> TrackResult:
+    ) -> GpuTracking:
         """See ``Tracker``."""
         device, shown = field.device, self.volume.show(frame)
         a, t, s = config.align, config.tracking, config.sampling
@@ -65,12 +83,7 @@ class GpuTracker:
         rates = _rates(t.lr_rotation, t.lr_translation, device)
         over = field if rays else None, self.volume.blocks, config, shown, order, rates, letter.there, dice.rows
         (found,) = self.recorder(partial(self._whole, *over), key=id(config), over=over, device=device, lent=True)
-        told = found.cpu().numpy()
-        pose, (cost, fit, usable), terms = told[:12], told[12:TOLD].tolist(), told[TOLD:]
-        if usable < LEAST_POINTS:
-            return TrackResult(guess, {}, 0.0)
-        losses = dict(zip(LOSS_NAMES, terms.tolist(), strict=True)) if rays else {"align_mm": 1e3 * cost**0.5}
-        return TrackResult(np.concatenate([pose.reshape(3, 4), guess[3:]]), losses, fit)
+        return GpuTracking(guess, found, rendered=rays > 0)
 
     def _given(self, random: int, sent: int) -> tuple[Dice, Letter]:
         """Dice for so many ``random`` numbers a frame, and a letter for those that are ``sent``: the last ones, since

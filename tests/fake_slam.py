@@ -105,7 +105,7 @@ class FakeSlam:
         self.field: FakeField | None = None
         self.finished = self.half_way = False
 
-    def step(self, frame: Frame, interrupt=None) -> StepReport:
+    def step(self, frame: Frame, interrupt=None, then=None) -> StepReport:
         b, first = self.behaviour, self.field is None
         if frame.index == b.fail_at:
             raise RuntimeError("the map exploded")

@@ -311,7 +311,7 @@ def test_a_frame_is_tracked_as_on_the_host(pair):
     seen = look(TRUE, corner(), CAMERA)
     for tracker, field in trackers(pair):
         for _ in range(2):  # the second one is recorded, where that can be
-            found = tracker.track(seen, GUESS, field, TINY)
+            found = tracker.begin(seen, GUESS, field, TINY).result()
             np.testing.assert_allclose(found.c2w, TRUE, atol=4e-3)
             assert found.fit > 0.95
             assert 0 < found.losses["align_mm"] < 5
@@ -324,9 +324,9 @@ def test_a_rolling_shutter_is_straightened_as_on_the_host(pair, rays):
     off = []
     for tracker, field in trackers(pair):
         rolling = replace(tracker, camera=replace(CAMERA, readout_s=0.03))
-        found = rolling.track(seen, GUESS, field, replace(TINY, tracking=tracking), SWEEP)
+        found = rolling.begin(seen, GUESS, field, replace(TINY, tracking=tracking), SWEEP).result()
         np.testing.assert_allclose(found.c2w, TRUE, atol=4e-3)
-        skewed = rolling.track(seen, GUESS, field, replace(TINY, tracking=tracking), STILL)
+        skewed = rolling.begin(seen, GUESS, field, replace(TINY, tracking=tracking), STILL).result()
         off.append([np.abs(each.c2w - TRUE).max() for each in (found, skewed)])
     assert all(found < 0.5 * skewed for found, skewed in off)
 
@@ -348,7 +348,7 @@ def test_a_replay_sees_the_newest_frame(pair):
         _, (tracker, field) = trackers(pair)
         tracker.recorder = recorder
         for c2w in (TRUE, TRUE, pose((1, 4, -2), (0.03, 0.02, -0.01))):
-            track = tracker.track(look(c2w, corner(), CAMERA), GUESS, field, TINY)
+            track = tracker.begin(look(c2w, corner(), CAMERA), GUESS, field, TINY).result()
             found.append(track.c2w)
     np.testing.assert_allclose(found[3:], found[:3], atol=1e-4)
     assert np.abs(found[2] - found[1]).max() > 0.01
@@ -361,7 +361,7 @@ def test_a_rendered_pose_is_taken_only_where_the_surface_agrees(pair):
     astray = replace(rendered, tracking=replace(rendered.tracking, iterations=5, lr_translation=0.1))
     for tracker, field in trackers(pair):
         for config in (rendered, astray):
-            found = tracker.track(seen, GUESS, field, config)
+            found = tracker.begin(seen, GUESS, field, config).result()
             assert list(found.losses) == list(LOSS_NAMES)
             assert np.isfinite(list(found.losses.values())).all()
             np.testing.assert_allclose(found.c2w, TRUE, atol=4e-3)
@@ -371,7 +371,7 @@ def test_a_frame_without_depth_is_not_tracked(pair):
     seen = look(TRUE, corner(), CAMERA)
     blind = replace(seen, depth=np.zeros_like(seen.depth))
     for tracker, field in trackers(pair):
-        found = tracker.track(blind, GUESS, field, TINY)
+        found = tracker.begin(blind, GUESS, field, TINY).result()
         assert (found.fit, found.losses) == (0.0, {})
         np.testing.assert_array_equal(found.c2w, GUESS)
 

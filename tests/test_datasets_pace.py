@@ -156,3 +156,15 @@ def test_playing_goes_on_at_a_frame_whatever_the_clock_says():
     assert played.arrived() == 7
     now += 1.01 / FPS
     assert played.arrived() == 8
+
+
+def test_the_next_frame_is_seen_before_it_is_taken():
+    with closing(KeepingUp(FakeSequence(3, bad=(1,)), Feed(1))) as frames:
+        assert frames.peek() is None
+        assert frames.ready(5)
+        seen = frames.peek()
+        assert next(frames)[1] is seen is not None
+        frames._arrivals.count, frames._arrivals.ended = 2, True
+        assert frames.ready(5)
+        assert frames.peek() is None  # it is left out
+        assert isinstance(next(frames)[1], FrameError)

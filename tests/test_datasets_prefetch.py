@@ -121,3 +121,19 @@ def test_an_exception_in_the_loop_body_leaves_no_thread_behind() -> None:
     while threading.active_count() > before and time.perf_counter() < deadline:
         time.sleep(0.01)
     assert threading.active_count() == before
+
+
+def test_the_next_frame_is_seen_before_it_is_taken() -> None:
+    frames = Prefetch(Probe(3, failures={1: FrameError("frame 1: torn")}, delay_s=0.05), threads=1)  # type: ignore[arg-type]
+    assert frames.peek() is None
+    assert frames.ready(5)
+    seen = frames.peek()
+    assert seen is not None
+    assert next(frames)[1] is seen
+    assert frames.ready(5)
+    assert frames.peek() is None  # it is left out
+    next(frames)
+    assert frames.ready(5)
+    next(frames)
+    assert frames.peek() is None
+    assert next(frames, None) is None

@@ -111,6 +111,11 @@ class KeepingUp(Iterator[tuple[int, Frame | FrameError]]):
             raise StopIteration
         return item
 
+    def peek(self) -> Frame | None:
+        """The frame that ``next`` gives, where it has been read and is none that is left out."""
+        item = self._item
+        return item[1] if item is not None and isinstance(item[1], Frame) else None
+
     def close(self) -> None:
         """Stop reading; nothing more is yielded."""
         with self._changed:

@@ -90,6 +90,13 @@ class Prefetch(Iterator[tuple[int, Frame | FrameError]]):
         _, coming = self._pending[0]
         return coming.done() or bool(wait([coming], seconds).done)
 
+    def peek(self) -> Frame | None:
+        """The frame that ``next`` gives, where it has been read and is none that is left out."""
+        if not self._pending or not self._pending[0][1].done():
+            return None
+        coming = self._pending[0][1].result()
+        return coming if isinstance(coming, Frame) else None
+
     def close(self) -> None:
         """Stop reading; nothing more is yielded."""
         self._pending.clear()

@@ -62,8 +62,9 @@ class SlamLike(Protocol):
         """The map, or None before the first frame's mapping has begun. With a map, ``query`` and ``render`` work."""
         ...
 
-    def step(self, frame: Frame, interrupt: Callable[[], None] | None = None) -> StepReport:
-        """Process a frame; ``interrupt`` is called inside long loops and may raise to abandon it."""
+    def step(self, frame: Frame, interrupt: Callable[[], None] | None = None, then: Frame | None = None) -> StepReport:
+        """Process a frame; ``interrupt`` is called inside long loops and may raise to abandon it. then: the next one,
+        where it is known already."""
         ...
 
     def finish(self, interrupt: Callable[[], None] | None = None) -> None:

@@ -283,7 +283,7 @@ class Engine:
                 if item is None:
                     run.require_frames()
                     return Turn.STOP
-                self._step(run, item, interrupt)
+                self._step(run, item, frames.peek(), interrupt)
 
     def _interrupt(self, run: Run, leave: Callable[[], bool]) -> Callable[[], None]:
         """What long loops of the engine proper call: it raises Abandoned when ``leave`` answers True."""
@@ -299,11 +299,13 @@ class Engine:
 
         return interrupt
 
-    def _step(self, run: Run, item: tuple[int, Frame | FrameError], interrupt: Callable[[], None]) -> None:
+    def _step(
+        self, run: Run, item: tuple[int, Frame | FrameError], then: Frame | None, interrupt: Callable[[], None]
+    ) -> None:
         if isinstance(item[1], Frame):
             self._workshop.first_look(run, item[1])
         try:
-            report = run.feed(*item, interrupt)
+            report = run.feed(*item, interrupt, then)
         except Abandoned:
             return
         self._control.stepped(run.tally.position, report is not None and report.loop is not None)

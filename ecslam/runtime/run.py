@@ -114,8 +114,11 @@ class Run:
 
     # ---- frames ---------------------------------------------------------------------------------------------------
 
-    def feed(self, index: int, item: Frame | FrameError, interrupt: Callable[[], None]) -> StepReport | None:
-        """Process a frame, or skip it (None) when it is unreadable or out of order in time.
+    def feed(
+        self, index: int, item: Frame | FrameError, interrupt: Callable[[], None], then: Frame | None = None
+    ) -> StepReport | None:
+        """Process a frame, or skip it (None) when it is unreadable or out of order in time. then: the next frame, where
+        it has been read already.
 
         Raises InputError when too many frames are unreadable or none is of use, and whatever ``interrupt`` raises (the
         run is then ``torn``: the frame at work is lost and there are no more checkpoints).
@@ -136,7 +139,7 @@ class Run:
             self.warn(odd, index)
         self._color = item.color
         try:
-            report = self._step(item, interrupt)
+            report = self._step(item, interrupt, then)
         except FrameError as error:
             self.slam = self.slam if self.tally.rows else None
             self._skip(index, str(error))
@@ -148,9 +151,9 @@ class Run:
         self._record(report, item)
         return report
 
-    def _step(self, frame: Frame, interrupt: Callable[[], None]) -> StepReport:
+    def _step(self, frame: Frame, interrupt: Callable[[], None], then: Frame | None) -> StepReport:
         slam = self.slam or self._build(frame.c2w_gt, None)
-        report = slam.step(frame, interrupt)
+        report = slam.step(frame, interrupt, then)
         if report.loop is None:
             return report
         return replace(report, loop=self.truth.with_errors(report.loop, report.c2w, self.tally))
