@@ -578,7 +578,7 @@ def test_controls_answer_at_once_while_the_page_is_busy(page, engine):
     [
         ("Run", "Step", m.Step()), ("Run to frame", True, m.RunTo(0)),
         ("Limit (frames/s)", 12, m.SpeedLimit(12.0)), ("Pause on loops", True, m.PauseOnLoop(True)),
-        ("Restart", True, m.Restart("synthetic/studio", "lite", 0, "strict", False)),
+        ("Restart", True, m.Restart("synthetic/studio", "lite", 0, "auto", False)),
         ("Go on with this preset", True, m.LoadPreset("lite")),
         ("Mapping", 33, m.Tune("mapping.iterations", 33)),
         ("Export mesh", True, m.Export("mesh", "ply", 0.02)),
