@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from test_datasets_layouts import WRITERS
 
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import Prefetch, open_sequence
@@ -201,6 +202,15 @@ def test_no_process_is_left_when_the_program_is_killed(folder):
         time.sleep(0.1)
 
 
+class Own:
+    """Somebody's own sequence."""
+
+    layout = "replica"
+
+    def __init__(self, sequence):
+        self.sequence = sequence
+
+
 def serves(pid):
     """Whether a process reads frames."""
     try:
@@ -214,6 +224,7 @@ def test_processes_are_for_recordings_on_a_gpu_and_many_cores(recording, monkeyp
     assert same(pickle.loads(portable(recording, "cuda:0"))[3].depth, recording[3].depth)
     assert portable(recording, "cpu") is None
     assert portable(open_sequence("synthetic/studio?size=160x120&frames=8"), "cuda") is None
+    assert portable(Own(recording), "cuda") is None
     monkeypatch.setattr(readers, "MOST_BYTES", 100)
     assert portable(recording, "cuda") is None
     monkeypatch.setattr(readers, "cores", lambda: 2)
@@ -265,3 +276,13 @@ def test_memory_is_locked_for_a_gpu_until_nothing_holds_a_frame(locked, monkeypa
     gc.collect()
     assert done == ([first, "wait", ("unlock", first[1])] if locked else [first])
     assert first[2] == memory
+
+
+@pytest.mark.parametrize("layout", sorted(set(WRITERS) - {"stray", "rosbag"}))
+def test_a_process_reads_what_was_opened_elsewhere(layout, tmp_path, monkeypatch):
+    monkeypatch.setattr(readers, "cores", lambda: 16)
+    opened = open_sequence(str(WRITERS[layout](tmp_path / layout)))
+    first = opened[0]
+    copy = pickle.loads(portable(opened, "cuda"))
+    assert all(same(copy[i], opened[i]) for i in range(len(opened)))
+    assert same(copy[0], first)

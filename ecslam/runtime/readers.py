@@ -29,13 +29,15 @@ PROGRAM = "import sys; sys.path[:] = {path!r}; from ecslam.runtime.reader import
 
 def portable(sequence: Sequence, device: str) -> bytes | None:
     """The sequence, pickled, where processes should read it; None where threads do it as well: without a GPU, on few
-    cores, and where it cannot be sent or lies in memory, as what is built in."""
+    cores, where it cannot be sent or lies in memory, as what is built in, and where its class is not ours, which a
+    process may not find."""
     enough = device.startswith("cuda") and sys.platform == "linux" and cores() >= FEWEST_CORES
-    if not enough or sequence.layout == "synthetic":
+    ours = type(sequence).__module__.startswith(__name__.partition(".")[0])
+    if not (enough and ours) or sequence.layout == "synthetic":
         return None
     try:
         sent = pickle.dumps(sequence)
-    except Exception:  # whatever a class of its own may raise
+    except (pickle.PicklingError, TypeError, AttributeError):
         return None
     return sent if len(sent) <= MOST_BYTES else None
 
