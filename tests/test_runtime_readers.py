@@ -19,6 +19,7 @@ from test_datasets_layouts import WRITERS
 
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import Prefetch, open_sequence
+from ecslam.datasets.prefetch import ReadingThreads
 from ecslam.datasets.slots import RESTING, Slots
 from ecslam.datasets.synthetic import write_replica
 from ecslam.runtime import readers, supply
@@ -145,14 +146,33 @@ def test_a_slot_rests_before_it_is_written_again():
     assert slots.take() is None
 
 
-@pytest.mark.parametrize("wrong", ["size", "type"])
-def test_a_frame_of_another_camera_is_sent_as_it_is(wrong):
+@pytest.mark.parametrize(
+    ("size", "light", "length"),
+    [((60, 80), "uint8", "float32"), ((120, 160), "uint8", "float64"), ((120, 160), "float32", "float32")],
+)
+def test_a_frame_of_another_camera_is_sent_as_it_is(size, light, length):
     slots = Slots(CAMERA, RESTING + 1)
-    size, kind = ((60, 80), np.float32) if wrong == "size" else ((120, 160), np.float64)
-    given = Frame(0, 0.0, np.zeros((*size, 3), np.uint8), np.ones(size, kind))
+    given = Frame(0, 0.0, np.zeros((*size, 3), light), np.ones(size, length))
     slot = slots.take()
     assert slots.found(slots.put(given, slot), slot) is given
     assert slots.take() is not None
+
+
+def test_there_are_no_more_slots_than_memory_for_them(monkeypatch):
+    monkeypatch.setattr("ecslam.datasets.slots.MOST_BYTES", 1 << 20)
+    assert Slots(CAMERA, 100).count == 4  # 211 kB each
+    assert Slots(CAMERA, 2).count == 2
+
+
+def test_without_memory_to_share_threads_read(recording, tmp_path, monkeypatch):
+    def none(name):
+        raise OSError(f"no memory for {name}")
+
+    monkeypatch.setattr(supply, "portable", lambda sequence, device: pickle.dumps(sequence))
+    monkeypatch.setattr("os.memfd_create", none)
+    engine = Engine(LIVE, recording, tmp_path / "run")
+    assert isinstance(engine._ahead._readers, ReadingThreads)
+    engine._ahead.close()
 
 
 def test_whoever_finds_no_slot_reads_alone(recording):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..types import Frame, Intrinsics
 
+MOST_BYTES = 1 << 30
 RESTING = 4  # slots that are left alone after their frame is gone: a GPU may still be fetching it
 ALIGNMENT = 4096
 OWN_DEPTH = np.empty((1, 1), np.float32)  # stands for measured depth that has a place of its own
@@ -22,7 +23,8 @@ NO_COLOR, NO_DEPTH = np.empty((0, 0, 3), np.uint8), np.empty((0, 0), np.float32)
 
 
 class Slots:
-    """Places for the images of ``count`` frames of a camera: colour, depth, and depth as it was measured.
+    """Places for the images of ``count`` frames of a camera, fewer where that would be over ``MOST_BYTES``: colour,
+    depth, and depth as it was measured.
 
     Whoever reads a frame ``put``s it into a slot in his process; ``found`` there by the one who asked for it, its
     images are views of the slot, which is taken until the last of them is gone. file: of the memory, for another
@@ -32,7 +34,8 @@ class Slots:
     def __init__(self, camera: Intrinsics, count: int, file: int | None = None) -> None:
         """file: of memory that is there already, which it takes over; None for new memory. Raises OSError where there
         is none."""
-        self.count, self._camera = count, camera
+        self._camera = camera
+        self.count = count = min(count, MOST_BYTES // self._size)
         self.file = os.memfd_create("frames") if file is None else file
         if file is None:
             os.ftruncate(self.file, count * self._size)
@@ -62,7 +65,8 @@ class Slots:
     def put(self, frame: Frame, slot: int) -> Frame:
         """The frame without its images, which lie in the slot now; itself where they do not fit the camera."""
         color, depth, measured = self._views(slot)
-        if frame.color.shape != color.shape or frame.depth.shape != depth.shape or frame.depth.dtype != depth.dtype:
+        pairs = (frame.color, color), (frame.depth, depth)
+        if any((given.shape, given.dtype) != (place.shape, place.dtype) for given, place in pairs):
             return frame
         color[:], depth[:] = frame.color, frame.depth
         kept = None if frame.measured is None else NO_DEPTH

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING
@@ -22,8 +23,9 @@ def frames_of(run: Run) -> Prefetch | KeepingUp:
         indices, prepare = range(position, len(sequence)), preparation(*asked)
         if (sent := portable(sequence, plan.device)) is None:
             return Prefetch(sequence, indices, prepare=prepare)
-        register = partial(page_lock, plan.device)
-        readers = ReadingProcesses(sent, sequence, asked[0], prepare, processes(), register)
-        return Prefetch(sequence, indices, readers=readers)
+        register, readers = partial(page_lock, plan.device), None
+        with suppress(OSError):  # without memory to share, threads read
+            readers = ReadingProcesses(sent, sequence, asked[0], prepare, processes(), register)
+        return Prefetch(sequence, indices, prepare=prepare, readers=readers)
     arrivals = Playback(sequence, lambda: run.clock.seconds, position) if run.live is None else run.live
     return KeepingUp(sequence, arrivals, position, prepare=preparation(*asked, lambda _: next(made)))
