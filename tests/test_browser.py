@@ -260,7 +260,7 @@ def test_switch_preset_and_start_over(live):
     visit.wait(lambda: restart.evaluate(shown) == "none")
     visit.choose("Preset", "full")
     visit.press("Restart")
-    visit.wait(lambda: m.Restart("synthetic/studio", "full", 0, "strict", False) in engine.log)
+    visit.wait(lambda: m.Restart("synthetic/studio", "full", 0, "auto", False) in engine.log)
     visit.page.locator(".ec-name", has_text="full").wait_for()
     assert engine.latest().preset == "full"
 
