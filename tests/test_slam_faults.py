@@ -105,14 +105,14 @@ def test_a_kidnapped_camera_is_noticed_and_found_again():
 def test_nan_in_a_tracked_pose_is_not_taken(monkeypatch):
     slam = engine()
     walk(slam, list(range(12)))
-    real, calls = HostTracker.track, []
+    real, calls = HostTracker._track, []
 
     def track(self, *args):
         found = real(self, *args)
         calls.append(1)
         return replace(found, c2w=np.full((4, 4), np.nan)) if len(calls) == 2 else found
 
-    monkeypatch.setattr(HostTracker, "track", track)
+    monkeypatch.setattr(HostTracker, "_track", track)
     reports = walk(slam, list(range(12, 20)))
     assert np.isfinite(slam.trajectory.poses()).all()
     assert reports[1].note == "recovered"
