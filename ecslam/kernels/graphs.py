@@ -69,7 +69,7 @@ class Recorder:
     and a function may change what it holds in place. Over other objects it is recorded at once, if that is possible. If
     it is to be ``plain``, without CUDA, and once recording has failed after a plain call, every call is plain;
     ``failure`` then says why. Results are copies. ``keep`` graphs are kept, the least recently used go first. One
-    thread may use it at a time, in one stream: its graphs share their memory.
+    thread may use it at a time, and only one of its graphs be at work: they share their memory.
     """
 
     def __init__(self, keep: int = 4, capture: Capture | None = None, plain: bool = False) -> None:
