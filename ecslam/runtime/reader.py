@@ -15,14 +15,6 @@ from .ahead import preparation
 GREETING = "ready"
 
 
-class Orders(NamedTuple):
-    """What a reader is told first. sequence: pickled. slots: how many."""
-
-    sequence: bytes
-    camera: Intrinsics
-    slots: int
-
-
 class Order(NamedTuple):
     """Read the frame ``number``, prepare it as ``config`` wants it, and put its images into ``slot``."""
 
@@ -31,8 +23,19 @@ class Order(NamedTuple):
     slot: int
 
 
+class Orders(NamedTuple):
+    """What a reader is told first. sequence: pickled. slots: how many. trial: read for practice, which on a new machine
+    compiles what there is to compile."""
+
+    sequence: bytes
+    camera: Intrinsics
+    slots: int
+    trial: Order
+
+
 def serve(line: int, memory: int) -> None:
-    """Do what comes over a ``line``, until it is cut; both are open files, ``memory`` that of the slots."""
+    """Do what comes over a ``line``, until it is cut; both are open files, ``memory`` that of the slots. Greets when it
+    can be told more, and when it has done its trial."""
     try:
         _serve(Connection(line), memory)
     except (EOFError, OSError):
@@ -48,8 +51,10 @@ def _serve(line: Connection, memory: int) -> None:
     line.send(GREETING)
     orders: Orders = line.recv()
     sequence, slots = pickle.loads(orders.sequence), Slots(orders.camera, orders.slots, memory)
-    now: list[Config] = []
+    now = [orders.trial.config]
     prepare = preparation(lambda: now[0], orders.camera, "cpu")
+    read(sequence, prepare, orders.trial.number)
+    line.send(GREETING)
     while True:
         order: Order = line.recv()
         now[:] = [order.config]

@@ -4,6 +4,7 @@ twice as long)."""
 
 from __future__ import annotations
 
+import os
 import pickle
 import subprocess
 import sys
@@ -24,6 +25,8 @@ FEWEST_CORES = 6
 LEFT = 2  # cores, for the engine
 HELD = 4  # frames that the engine may hold, the last one and the one at work among them
 MOST_BYTES = 16 << 20  # of a sequence, which every process is sent
+THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"
+ALONE = {"CUDA_VISIBLE_DEVICES": "", **dict.fromkeys(THREADS, "1")}  # one core, and the GPU is the engine's
 PROGRAM = "import sys; sys.path[:] = {path!r}; from ecslam.runtime.reader import serve; serve({line}, {memory})"
 
 
@@ -66,7 +69,7 @@ class ReadingProcesses:
         self.ahead = 2 * count
         self._sequence, self._config, self._prepare = sequence, config, prepare
         self._slots = Slots(sequence.intrinsics, self.ahead + HELD + RESTING)
-        self._orders = Orders(sent, sequence.intrinsics, self._slots.count)
+        self._orders = Orders(sent, sequence.intrinsics, self._slots.count, Order(0, config(), 0))
         self._own = threading.local()
         self._helpers: list[Helper] = []
         self._pool = ThreadPoolExecutor(count, "prefetch", self._take_helper)
@@ -107,7 +110,7 @@ class Helper:
 
     def __init__(self, orders: Orders, memory: int) -> None:
         """memory: the open file of the slots."""
-        self._orders, self._greeted, self._gone = orders, False, False
+        self._orders, self._greeted, self._gone = orders, 0, False
         self._line, theirs = Pipe()
         with theirs:
             program = PROGRAM.format(path=sys.path, line=theirs.fileno(), memory=memory)
@@ -115,18 +118,20 @@ class Helper:
                 [sys.executable, "-c", program],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(), memory),
+                env=os.environ | ALONE,
                 start_new_session=True,  # Ctrl-C is for the program that was started
             )
 
     def ready(self) -> bool:
         """Whether it takes orders by now."""
         try:
-            if not self._greeted and not self._gone and self._line.poll():
-                self._greeted = self._line.recv() == GREETING
-                self._line.send(self._orders)
+            if self._greeted < 2 and not self._gone and self._line.poll():
+                self._greeted += self._line.recv() == GREETING
+                if self._greeted == 1:
+                    self._line.send(self._orders)
         except (EOFError, OSError):
             self._gone = True
-        return self._greeted and not self._gone
+        return self._greeted == 2 and not self._gone
 
     def read(self, order: Order) -> Frame | FrameError | None:
         """What came of an order; None where the process has died."""
