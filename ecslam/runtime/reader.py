@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import pickle
-from multiprocessing.connection import Connection
-from typing import NamedTuple
+import select
+import socket
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 from ..config import Config
 from ..datasets.prefetch import read
 from ..datasets.slots import Slots
 from ..types import Frame, Intrinsics
 from .ahead import preparation
+from .memory import keep_no_holes
 
 GREETING = "ready"
+CUT = EOFError, OSError, pickle.UnpicklingError
 
 
 class Order(NamedTuple):
@@ -37,26 +41,54 @@ def serve(line: int, memory: int) -> None:
     """Do what comes over a ``line``, until it is cut; both are open files, ``memory`` that of the slots. Greets when it
     can be told more, and when it has done its trial."""
     try:
-        _serve(Connection(line), memory)
-    except (EOFError, OSError):
+        _serve(Line(socket.socket(fileno=line)), memory)
+    except CUT:
         return
 
 
-def _serve(line: Connection, memory: int) -> None:
+class Line:
+    """Objects over a socket, in either direction. What it does raises one of ``CUT`` when the other end is gone. Unlike
+    those of ``multiprocessing`` it closes its file once, whoever comes first."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self._end, self._file = end, end.makefile("rwb")
+
+    def send(self, item: object) -> None:
+        """Send it."""
+        pickle.dump(item, self._file, pickle.HIGHEST_PROTOCOL)
+        self._file.flush()
+
+    def receive(self) -> Any:
+        """What comes next; waits for it."""
+        return pickle.load(self._file)
+
+    def waiting(self) -> bool:
+        """Whether something has come."""
+        return bool(select.select([self._end], [], [], 0)[0])
+
+    def close(self) -> None:
+        """Cut it."""
+        with suppress(*CUT):
+            self._file.close()
+        self._end.close()
+
+
+def _serve(line: Line, memory: int) -> None:
     import cv2
     import torch
 
+    keep_no_holes()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     line.send(GREETING)
-    orders: Orders = line.recv()
+    orders: Orders = line.receive()
     sequence, slots = pickle.loads(orders.sequence), Slots(orders.camera, orders.slots, memory)
     now = [orders.trial.config]
     prepare = preparation(lambda: now[0], orders.camera, "cpu")
     read(sequence, prepare, orders.trial.number)
     line.send(GREETING)
     while True:
-        order: Order = line.recv()
+        order: Order = line.receive()
         now[:] = [order.config]
         found = read(sequence, prepare, order.number)
         line.send(slots.put(found, order.slot) if isinstance(found, Frame) else found)

@@ -6,20 +6,20 @@ from __future__ import annotations
 
 import os
 import pickle
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from multiprocessing import Pipe
 
 from ..config import Config
 from ..cores import cores
 from ..datasets.prefetch import MOST_WORKERS, read
 from ..datasets.slots import RESTING, Slots
 from ..types import Frame, FrameError, Sequence
-from .reader import GREETING, Order, Orders
+from .reader import CUT, GREETING, Line, Order, Orders
 
 FEWEST_CORES = 6
 LEFT = 2  # cores, for the engine
@@ -111,7 +111,8 @@ class Helper:
     def __init__(self, orders: Orders, memory: int) -> None:
         """memory: the open file of the slots."""
         self._orders, self._greeted, self._gone = orders, 0, False
-        self._line, theirs = Pipe()
+        mine, theirs = socket.socketpair()
+        self._line = Line(mine)
         with theirs:
             program = PROGRAM.format(path=sys.path, line=theirs.fileno(), memory=memory)
             self._process = subprocess.Popen(
@@ -125,11 +126,11 @@ class Helper:
     def ready(self) -> bool:
         """Whether it takes orders by now."""
         try:
-            if self._greeted < 2 and not self._gone and self._line.poll():
-                self._greeted += self._line.recv() == GREETING
+            if self._greeted < 2 and not self._gone and self._line.waiting():
+                self._greeted += self._line.receive() == GREETING
                 if self._greeted == 1:
                     self._line.send(self._orders)
-        except (EOFError, OSError):
+        except CUT:
             self._gone = True
         return self._greeted == 2 and not self._gone
 
@@ -137,9 +138,9 @@ class Helper:
         """What came of an order; None where the process has died."""
         try:
             self._line.send(order)
-            found: Frame | FrameError = self._line.recv()
+            found: Frame | FrameError = self._line.receive()
             return found
-        except (EOFError, OSError):
+        except CUT:
             self._gone = True
             return None
 
