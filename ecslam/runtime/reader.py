@@ -13,7 +13,6 @@ from ..datasets.prefetch import read
 from ..datasets.slots import Slots
 from ..types import Frame, Intrinsics
 from .ahead import preparation
-from .memory import keep_no_holes
 
 GREETING = "ready"
 CUT = EOFError, OSError, pickle.UnpicklingError
@@ -77,7 +76,6 @@ def _serve(line: Line, memory: int) -> None:
     import cv2
     import torch
 
-    keep_no_holes()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     line.send(GREETING)

@@ -26,7 +26,10 @@ LEFT = 2  # cores, for the engine
 HELD = 4  # frames that the engine may hold, the last one and the one at work among them
 MOST_BYTES = 16 << 20  # of a sequence, which every process is sent
 THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"
-ALONE = {"CUDA_VISIBLE_DEVICES": "", **dict.fromkeys(THREADS, "1")}  # one core, and the GPU is the engine's
+KEPT = {"MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(128 << 20)}
+ALONE = KEPT | dict.fromkeys(THREADS, "1") | {"CUDA_VISIBLE_DEVICES": ""}
+"""What a process is told by its environment: to keep the memory of images for the next ones (glibc), to take one core,
+and to leave the GPU alone."""
 PROGRAM = "import sys; sys.path[:] = {path!r}; from ecslam.runtime.reader import serve; serve({line}, {memory})"
 
 
