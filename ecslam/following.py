@@ -21,7 +21,7 @@ from .keyframes import Keyframe
 from .movers import without_movers
 from .observed import ObservedVoxels
 from .observed_gpu import ObservedTable
-from .recovery import SUDDEN_DEG, SUDDEN_M, Recovery, around, near
+from .recovery import SUDDEN_DEG, SUDDEN_M, Recovery, around, best, near
 from .relocalisation import Relocalisation
 from .samples import seeded
 from .saving import Arrays, part, prefixed
@@ -147,7 +147,7 @@ class Follower:
                 soon = Expected(trajectory.predict(then.timestamp), True, False)
                 self._ahead = (then, *self.looked_at(then, soon, trajectory, config))
         others = (tracker.begin(frame, start, field, config, sweep).result() for start in starts[1:])
-        track = max([tracking.result(), *others], key=lambda result: result.fit)
+        track = best([tracking.result(), *others])
         elsewhere = Relocalisation(frame, self._camera, surface, trajectory, keyframes, config, self._rng)
         return self.recovery.judge(track, trajectory[-1], elsewhere, expected.gap)
 

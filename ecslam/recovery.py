@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Protocol
 
@@ -108,8 +108,6 @@ def around(c2w: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     return list(retract(torch.from_numpy(c2w).expand(len(moves), 4, 4), moves).numpy())
 
 
-def best_start(
-    track: Callable[[NDArray[np.float64]], TrackResult], starts: Iterable[NDArray[np.float64]]
-) -> TrackResult:
-    """Track from every start pose [4, 4] and keep the result that the map explains best."""
-    return max((track(start) for start in starts), key=lambda result: result.fit)
+def best(results: Iterable[TrackResult]) -> TrackResult:
+    """The one of several results that the map explains best."""
+    return max(results, key=lambda result: result.fit)

@@ -14,7 +14,7 @@ from .config import Config
 from .keyframes import Keyframe, make_thumbnail, most_similar
 from .landmarks import SOUGHT, Recognition, find_landmarks
 from .pixels import Pixels, spread_pixels
-from .recovery import best_start
+from .recovery import best
 from .se3 import retract
 from .tracker import LEAST_POINTS, TrackResult, track_direct
 from .trajectory import Trajectory
@@ -63,7 +63,7 @@ class Relocalisation:
             return None
         wide = replace(self.config, align=replace(self.config.align, kernels_m=KERNELS_M, iterations=ITERATIONS))
         gain = self.frame.gain
-        return best_start(lambda start: track_direct(self.surface, self._measured, start, wide, gain), starts)
+        return best(track_direct(self.surface, self._measured, start, wide, gain) for start in starts)
 
     @cached_property
     def _measured(self) -> Pixels:
