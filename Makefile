@@ -19,7 +19,7 @@ test: $(VENV)/.ready-dev lint
 	$(BIN)/python -m pytest --durations=10
 
 quick: $(VENV)/.ready-dev lint
-	$(BIN)/python -m pytest -n auto -m "not slow and not browser"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not browser"
 
 check lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .

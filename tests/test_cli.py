@@ -106,6 +106,7 @@ def assert_refused(outcome: Outcome, *parts: str) -> None:
 # ---- a small run ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_synth_says_how_to_open_a_room_with_a_rolling_shutter(tmp_path):
     done = ecslam("synth", f"{ROOM}&readout=0.03", tmp_path / "rolling", "--frames", "0:2")
     assert f"open it as {tmp_path / 'rolling'}?readout=0.03" in done.out
@@ -194,6 +195,7 @@ def test_evo_finds_the_same_error(finished):
     assert summary(finished)["ate_rmse_cm"] == pytest.approx(100 * ape.get_statistic(metrics.StatisticsType.rmse), 0.01)
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bytes(finished, sequence, tmp_path):
     assert ecslam(*run_words(sequence, tmp_path / "again")).code == 0
     assert (tmp_path / "again" / "trajectory.txt").read_bytes() == (finished / "trajectory.txt").read_bytes()

@@ -66,6 +66,7 @@ def test_gains_stay_where_too_little_is_seen_again():
     assert as_at_first(ROOM[31], ROOM.intrinsics, POSES[0], EarlierViews().asked, POSES, 1.25).gain == 1.25
 
 
+@pytest.mark.slow
 def test_gains_do_not_wander_through_what_they_made_themselves():
     earlier, gain, off = EarlierViews(), 1.0, []
     poses = np.stack([ROOM[i].c2w_gt for i in range(0, 150, 5)])
@@ -133,6 +134,7 @@ def fading() -> list[Frame]:
     return [before_a_wall(i, 1.2 - 0.012 * i) for i in range(60)]
 
 
+@pytest.mark.slow
 def test_luminance_tells_where_the_camera_is_whatever_its_exposure(fading):
     followed, left, steady = (
         run(exposure, frames)[0]

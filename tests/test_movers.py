@@ -182,10 +182,12 @@ def runs():
     return found
 
 
+@pytest.mark.slow
 def test_who_walks_through_does_not_take_the_camera_along(runs):
     assert runs[False][0] < 0.5 * runs[True][0]
 
 
+@pytest.mark.slow
 def test_it_is_said_once_that_something_moves(runs):
     frames = [frame for frame, note in runs[False][1] if note == MOVING]
     assert len(frames) in (1, 2)

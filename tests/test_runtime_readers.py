@@ -251,6 +251,7 @@ def test_processes_are_for_recordings_on_a_gpu_and_many_cores(recording, monkeyp
     assert portable(recording, "cuda") is None
 
 
+@pytest.mark.slow
 def test_a_run_is_the_same_whoever_reads(folder, tmp_path, monkeypatch):
     small = ["align.points=300", "mapping.first_iterations=5", "mapping.iterations=2", "mapping.final_iterations=2"]
     config, paths = apply_settings(LIVE, [*small, "mapping.rays=60"]), []

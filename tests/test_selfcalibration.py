@@ -210,6 +210,7 @@ def test_views_all_around_tell_the_camera(round_a_room: tuple[list[np.ndarray], 
     assert np.linalg.norm(joint.poses[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_camera_that_hardly_moves_does_not_tell_its_focal_length() -> None:
     room = open_sequence("synthetic/studio?frames=3000&size=320x240&noise=1")
     near = select_frames(room, "0:60")

@@ -97,6 +97,7 @@ def test_the_volume_holds_what_a_still_camera_would_have_seen():
     assert np.median(off[True]) > 2e-3
 
 
+@pytest.mark.slow
 def test_a_room_seen_row_by_row_is_tracked_better_with_it():
     room = open_sequence("synthetic/studio?frames=300&size=240x180&readout=0.03")
     frames, off = [room[i] for i in range(60)], []
