@@ -10,75 +10,58 @@ from typing import Annotated
 import typer
 
 from . import config_files
+from .bench_cli import bench
 from .config import Config
-from .runtime.files import require_place
+from .options import (
+    CameraArgument,
+    ConfigFile,
+    Data,
+    Device,
+    Frames,
+    Headless,
+    Host,
+    NoBrowser,
+    Out,
+    Port,
+    Preset,
+    Realtime,
+    Record,
+    RunFolder,
+    Schedule,
+    Seed,
+    SequenceArgument,
+    Settings,
+)
 from .runtime.outlets import lasting_outputs
 from .types import InputError, Sequence
 
 app = typer.Typer(
     name="ecslam",
-    help="EC-SLAM: neural RGB-D SLAM that you watch live in a browser.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
     rich_markup_mode="rich",
 )
-bench = typer.Typer(help="Measure: back ends against each other, speed, accuracy.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
 
 
-def _place(option: typer.CallbackParam, file: Path | None) -> Path | None:
-    """What an option names, once it is sure that it can be written. Raises InputError."""
-    if file is not None:
-        require_place(file, f"--{option.name}")
-    return file
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        from .commands import pick_device
+        from .provenance import provenance
+
+        for name, value in provenance(pick_device("auto")).items():
+            print(f"{name:8} {value}")
+        raise typer.Exit
 
 
-SequenceArgument = Annotated[
-    str,
-    typer.Argument(
-        help="A folder (7-Scenes, TUM RGB-D, Replica, ScanNet ..., recognised by itself), a file (.bag, .mcap, .db3, "
-        ".sens, .r3d), a built-in room (synthetic/studio, synthetic/apartment, synthetic/corridor) or, to run on, "
-        "a camera that is plugged in: camera/realsense."
-    ),
-]
-Preset = Annotated[str | None, typer.Option(help="lite, full, live, scannet or tum; default: what suits the layout.")]
-ConfigFile = Annotated[
-    Path | None, typer.Option("--config", help="A YAML file laid over the preset; it may name that.")
-]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="One setting, e.g. mapping.iterations=20; may be repeated."),
-]
-Frames = Annotated[str, typer.Option(metavar="A:B:STEP", help="Which frames, as a Python slice; default: all.")]
-Seed = Annotated[int | None, typer.Option(min=0, help="Random seed; default: the configuration's (0).")]
-Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ... or auto: a CUDA GPU where there is one.")]
-Schedule = Annotated[
-    str | None,
-    typer.Option(help="strict (deterministic on a CPU), overlap (maps while it tracks) or auto (overlap on a GPU)."),
-]
-Realtime = Annotated[
-    bool, typer.Option("--realtime", help="As from a camera: no faster than recorded, frames are left out to keep up.")
-]
-Record = Annotated[
-    Path | None, typer.Option(help="Where a camera's images go, a new folder; default: recordings/CAMERA-TIME.")
-]
-CameraArgument = Annotated[
-    str, typer.Argument(help="A camera that is plugged in, as in 'camera/realsense?size=640x480&fps=30'.")
-]
-Headless = Annotated[bool, typer.Option("--headless", help="No dashboard: run, write the run folder, end.")]
-Out = Annotated[
-    Path | None, typer.Option(help="Run folder; a run in it is replaced. Default: a new one, runs/SEQUENCE-PRESET.")
-]
-Data = Annotated[
-    list[Path] | None,
-    typer.Option(metavar="FOLDER", help="A folder with sequences that the dashboard offers too; may be repeated."),
-]
-Host = Annotated[str, typer.Option(help="Where the dashboard listens; any but 127.0.0.1 needs the token it prints.")]
-Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the dashboard; 0 = any free one.")]
-NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Do not open a browser; the address is printed.")]
-Json = Annotated[Path | None, typer.Option(callback=_place, help="Write every figure to this file.")]
-RunFolder = Annotated[Path, typer.Argument(help="A run folder, as `ecslam run` leaves it.")]
+@app.callback()
+def ecslam(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="What is installed, and on what.")
+    ] = False,
+) -> None:
+    """EC-SLAM: neural RGB-D SLAM that you watch live in a browser."""
 
 
 @app.command()
@@ -256,100 +239,6 @@ def calibrate(
     from . import commands
 
     commands.calibrate(sequence, frames, out)
-
-
-@bench.command(name="kernels")
-def bench_kernels(
-    rays: Annotated[int, typer.Option(min=1, help="Rays; 43 samples each.")] = 1000,
-    repeats: Annotated[int, typer.Option(min=3, help="Runs of each; medians are printed.")] = 5,
-    json: Json = None,
-) -> None:
-    """Time the fast back ends against the plain torch reference, in turn, on one mapping and one tracking step."""
-    from . import commands
-    from .bench.kernels import bench_kernels, print_table
-
-    result = bench_kernels(rays, repeats)
-    print_table(result)
-    commands.write_json(json, result)
-
-
-@bench.command(name="speed")
-def bench_speed(
-    sequence: SequenceArgument = "synthetic/studio",
-    presets: Annotated[str, typer.Option(help="Presets to run, separated by commas.")] = "live,lite",
-    frames: Frames = "0:200",
-    repeats: Annotated[int, typer.Option(min=1, help="Runs of each; medians are printed.")] = 3,
-    device: Device = "auto",
-    peer: Annotated[bool, typer.Option("--peer", help="Also run Open3D's dense SLAM, if it is installed.")] = False,
-    json: Json = None,
-    plot: Annotated[
-        Path | None, typer.Option(callback=_place, help="Write a plot of the cost per frame to this PNG file.")
-    ] = None,
-) -> None:
-    """Frames per second, all included; time per stage; growth of cost and memory; a rival beside it."""
-    from . import commands
-    from .bench.runs import require_a_run
-    from .bench.speed import bench_speed, plot_speed, print_table
-
-    names = [name.strip() for name in presets.split(",")]
-    result = bench_speed(sequence, names, frames, repeats, commands.pick_device(device), peer)
-    print_table(result)
-    commands.write_json(json, result)
-    require_a_run([result["errors"][name] for name in names], repeats)
-    if plot is not None:
-        plot_speed(result, plot)
-
-
-@bench.command(name="viewers")
-def bench_viewers(
-    sequence: SequenceArgument = "synthetic/studio",
-    preset: Annotated[str, typer.Option(help="Preset, or a YAML file.")] = "live",
-    frames: Frames = "",
-    viewers: Annotated[int, typer.Option(min=1, max=200, help="How many pages are open at once.")] = 20,
-    pairs: Annotated[int, typer.Option(min=1, help="Comparisons at most; the median is printed.")] = 5,
-    device: Device = "auto",
-    json: Json = None,
-) -> None:
-    """Frames per second with many open pages against none, in turn within one run."""
-    from . import commands
-    from .bench.viewers import print_result
-
-    result = commands.bench_viewers(sequence, preset, frames, viewers, pairs, commands.pick_device(device))
-    print_result(result)
-    commands.write_json(json, result)
-
-
-@bench.command(name="accuracy")
-def bench_accuracy(
-    sequence: SequenceArgument = "synthetic/studio",
-    presets: Annotated[str, typer.Option(help="Presets to run, separated by commas.")] = "lite",
-    frames: Frames = "",
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each, with seeds 0, 1, ...")] = 3,
-    ablate: Annotated[bool, typer.Option("--ablate", help="Also without FUS, without EBA, without both.")] = False,
-    no_surface: Annotated[bool, typer.Option("--no-surface", help="Trajectories only: saves minutes a run.")] = False,
-    settings: Settings = None,
-    device: Device = "auto",
-    json: Json = None,
-) -> None:
-    """Trajectory and surface against the ground truth, mean and deviation over seeds; the paper's ablation."""
-    from . import commands
-    from .bench.accuracy import bench_accuracy, print_table
-    from .bench.runs import errors, require_a_run
-
-    names = [name.strip() for name in presets.split(",")]
-    result = bench_accuracy(
-        sequence,
-        names,
-        frames,
-        seeds,
-        commands.pick_device(device),
-        ablate=ablate,
-        surface=not no_surface,
-        settings=settings or [],
-    )
-    print_table(result)
-    commands.write_json(json, result)
-    require_a_run(list(errors(result["variants"]).values()), seeds)
 
 
 def resolve_config(

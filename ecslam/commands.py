@@ -318,10 +318,13 @@ def calibrate(address: str, frames: str, out: Path | None) -> None:
         console.print(f"{place}: says otherwise; remove it if this recording is better", soft_wrap=True)
 
 
-def write_json(path: Path | None, result: dict[str, Any]) -> None:
-    """Write figures to a file, when one is wanted. Raises InputError."""
+def write_json(path: Path | None, result: dict[str, Any], device: str) -> None:
+    """Write figures that were measured on ``device`` to a file, when one is wanted, with what made them. Raises
+    InputError."""
     if path is not None:
-        write_named(path, to_json(result).encode())
+        from .provenance import provenance
+
+        write_named(path, to_json({**result, "made_by": provenance(device)}).encode())
 
 
 def _progress() -> Progress:

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from ecslam import cli, commands, reports
+from ecslam import __version__, cli, commands, reports
 from ecslam.bench import accuracy, speed
 from ecslam.config_files import apply_settings, load_config, load_preset
 from ecslam.datasets.meshes import load_mesh
@@ -165,6 +165,7 @@ def test_summary_has_the_keys_that_others_rely_on(finished, sequence):
     assert (found["frames"], found["keyframes"], found["seed"], found["preset"]) == (8, 2, 3, "lite")
     assert (found["skipped_frames"], found["lost_frames"]) == (0, 0)
     assert found["ate_mean_cm"] <= found["ate_rmse_cm"] <= found["ate_max_cm"]
+    assert found["made_by"]["ecslam"].startswith(__version__)
     assert found["parameters_mb"] == pytest.approx(4e-6 * found["parameters"], abs=1e-3)
 
 

@@ -21,7 +21,7 @@ LAYERS = (
     ("types", "messages", "config", "config_files", "strict_yaml"),
     ("rigid", "indices", "compiled", "atomic", "cores", "interrupts"),
     ("se3",),
-    ("kernels",),
+    ("kernels", "provenance"),
     ("field",),
     (
         "datasets",
@@ -61,6 +61,8 @@ LAYERS = (
     ("reports",),
     ("commands",),
     ("camera_commands",),
+    ("options",),
+    ("bench_cli",),
     ("cli",),
     ("__main__",),
 )

@@ -27,7 +27,7 @@ from ecslam.runtime.tally import Tally
 from ecslam.types import InputError
 
 SUMMARY_KEYS = """
-    sequence preset ended error device kernels seed frames keyframes wall_s setup_s fps_wall fps_engine
+    sequence preset ended error made_by device kernels seed frames keyframes wall_s setup_s fps_wall fps_engine
     ate_rmse_cm ate_mean_cm ate_max_cm parameters parameters_mb peak_memory_mb skipped_frames lost_frames loop_closures
     dropped_frames kernels_note unreadable_frames frames_without_ground_truth warnings export_s not_saved
 """

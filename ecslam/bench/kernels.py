@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from ..kernels import AlignSettings, Backend, RayBatch, Weights
 from ..kernels.graphs import Recorder
 from ..kernels.reference import sample_depths
 from ..kernels.types import FEATURES, HIDDEN
+from ..provenance import machine
 from ..rays import kernel_weights
 from ..types import InputError
 
@@ -61,7 +61,7 @@ def bench_kernels(rays: int = 1000, repeats: int = 5, device: str | None = None,
     floors = {name: _floor(name, rays, rates) for name in jobs}
     return {
         "device": device,
-        "machine": torch.cuda.get_device_name() if device == "cuda" else platform.processor() or platform.machine(),
+        "machine": machine(device),
         "threads": torch.get_num_threads(),
         "rays": rays,
         "samples": rays * _samples(Config()),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 import statistics
 import tempfile
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from rich.table import Table
 
 from ..datasets import open_sequence, select_frames
 from ..messages import Snapshot
+from ..provenance import machine
 from ..runtime.checkpoint import load_checkpoint
 from ..runtime.engine import Engine
 from ..runtime.memory import resident_mb
@@ -78,7 +78,7 @@ def bench_speed(
         "sequence": sequence,
         "frames": frames,
         "device": device,
-        "machine": torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.machine(),
+        "machine": machine(device),
         "threads": torch.get_num_threads(),
         "repeats": repeats,
         "presets": medians,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ..provenance import provenance
 from .memory import peak_memory_mb
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def summarise(run: Run, ended: str, error: str, export_s: float) -> dict[str, An
         "preset": run.config.preset,
         "ended": ended,
         "error": error,
+        "made_by": provenance(run.plan.device),
         "device": run.plan.device,
         "kernels": slam.kernels_name if slam else None,
         "kernels_note": slam.kernels_note if slam else "",
