@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ class Beside:
     def __init__(self, device: torch.device) -> None:
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._pool = None if self._stream else ThreadPoolExecutor(1, "mapper")
+        if self._stream is not None:  # a map that is dropped in the middle must not be written to once others lie there
+            weakref.finalize(self, self._stream.synchronize)
         self._window: NDArray[np.int64] = np.empty(0, np.int64)
         self._coming: Future[MapResult] | Mapping | None = None
 

@@ -158,6 +158,8 @@ class Mapper:
             self._desk = Desk(room, m.rays, device)
         rates = job.pose_rates(fixed).numpy()
         chosen = self._desk.lay_out(self._bank, views, c2w, rates, m.newest_share, self._box)
+        # Triton compiles some kernels once for sizes that are multiples of 16 and once for others.
+        aligned = self.field.params.table.numel() % 16 == 0
         generator, recorder = seeded(self._rng, device), Recorder(plain=True) if job.smooth else self.recorder
         for left in _fading(iterations, device).split(max(iterations, 1) if job.move else CHUNK):
             interrupt()
@@ -165,7 +167,7 @@ class Mapper:
             poses, found, sound = recorder(
                 partial(self._loop, job, chosen, jitter),
                 left,
-                key=(id(config), job.move, job.smooth, job.settle, chosen.missing),
+                key=(id(config), job.move, job.smooth, job.settle, chosen.missing, aligned),
                 over=(self.field, self._optimiser, config, chosen.pixels, chosen.numbers, chosen.row, jitter),
                 lent=True,
             )

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from .kernels import DevicePixels
 from .pixels import Pixels
@@ -46,9 +49,14 @@ class PixelBank:
             held, given = self.columns, (view.direction, view.depth, view.color, view.feature)
             columns = (held.direction[:, :2], held.depth, held.color, held.feature)
             for column, new in zip(columns, given, strict=True):
-                column[first:last].copy_(torch.from_numpy(new), non_blocking=True)
+                column[first:last].copy_(self._ready(new), non_blocking=True)
             self._places[key], self._used = Place(view, first, bool((view.depth <= 0).any())), last
         return self._places[key]
+
+    def _ready(self, given: NDArray[Any]) -> Tensor:
+        """The same numbers, where a GPU fetches them by itself: the host would wait for what it is at before."""
+        numbers = torch.from_numpy(given)
+        return numbers.pin_memory() if self._device.type == "cuda" else numbers
 
     def _require(self, rows: int) -> None:
         if rows > len(self.columns.depth):

@@ -14,7 +14,7 @@ from ecslam import kernels as seam
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.draws import Desk, DeviceDraw, DeviceViews, shares
-from ecslam.field import create_field
+from ecslam.field import create_field, grow_field
 from ecslam.kernels import FieldParams, RayBatch, StepResult, reference
 from ecslam.kernels.graphs import Recorder
 from ecslam.keyframes import make_keyframe
@@ -116,16 +116,25 @@ def test_replayed_loops_do_what_plain_ones_do(room, config, holes):
     assert (graphs.recorded, graphs.replayed) == (2, 3 + 2)
 
 
-def test_a_loop_that_follows_growth_is_recorded_again(room, config):
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_loop_that_follows_growth_is_recorded_again(room, config, compiled):
+    """At once where its kernels are compiled: Triton does that for sizes that are multiples of 16, and for others."""
     views, poses = keyframes(room, config)
     graphs = FakeGraphs()
     one = mapper(room, config, Recorder(capture=graphs.capture))
-    job = Job(config, move=False, smooth=False, settle=False)
-    one._on_device(job, views, poses, np.ones(3, bool), 30, lambda: None)
-    assert graphs.recorded == 1
-    one.grow(one.field.layout.box.numpy() * 1.5)
-    one._on_device(job, views, poses, np.ones(3, bool), 30, lambda: None)
-    assert graphs.recorded == 2
+    job, box = Job(config, move=True, smooth=False, settle=False), one.field.layout.box.numpy()
+
+    def map_once():
+        one._on_device(job, views, poses, np.ones(3, bool), 4, lambda: None)
+        return graphs.recorded
+
+    def aligned(field):
+        return field.params.table.numel() % 16 == 0
+
+    assert [map_once(), map_once()] == [0, 1]
+    boxes = (box * scale for scale in np.arange(1.1, 3, 0.05))
+    one.grow(next(box for box in boxes if (aligned(grow_field(one.field, box)) == aligned(one.field)) == compiled))
+    assert [map_once(), map_once()] == [2 if compiled else 1, 2]
 
 
 @pytest.mark.slow

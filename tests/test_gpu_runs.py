@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ecslam import volume_gpu
 from ecslam.config_files import apply_settings, load_preset
 from ecslam.datasets import open_sequence
 from ecslam.datasets.slots import RESTING, Slots
@@ -68,6 +69,23 @@ def test_loops_are_recorded_again_where_the_map_grows(preset):
     assert (slam._follower.recorder.failure, slam.mapper.recorder.failure) == ("", "")
     off = slam.trajectory.poses()[:, :3, 3] - np.stack([room[i].c2w_gt[:3, 3] for i in range(FRAMES)])
     assert np.sqrt(np.square(off).sum(1).mean()) < 0.02
+
+
+@pytest.mark.slow
+def test_loops_are_recorded_again_where_the_volume_grows(frames, monkeypatch):
+    monkeypatch.setattr(volume_gpu, "SLOTS", 1 << 11)
+    room, seen = frames
+    config, first = load_preset("live"), seen[0].c2w_gt
+    slam = Slam(config, room.intrinsics, device=torch.device("cuda"), bounds=room.bounds, first_pose=first)
+    forgotten, tracking = [], slam._follower.recorder
+    forget = tracking.forget
+    monkeypatch.setattr(tracking, "forget", lambda: (forgotten.append(1), forget()))
+    for frame in seen:
+        slam.step(frame)
+    slam.finish()
+    assert len(forgotten) > 1
+    assert tracking.failure == ""
+    assert replays(tracking) >= 2
 
 
 def test_a_gpu_fetches_from_slots_by_itself():

@@ -1,5 +1,7 @@
 """Recorded loops: what is run plainly, what is replayed, and what happens when recording is impossible."""
 
+import gc
+import weakref
 from contextlib import contextmanager, nullcontext
 
 import pytest
@@ -173,12 +175,85 @@ def test_after_a_recording_that_fails_the_thread_is_in_its_own_stream(monkeypatc
 
     def refuse():
         assert now == ["recording"]
+        assert not gc.isenabled()
         raise RuntimeError("operation not permitted when stream is capturing")
 
     with pytest.raises(RuntimeError, match="previous error") as raised:
         capture_cuda(refuse, torch.device("cuda"), (0, 1))
     assert "not permitted" in str(raised.value.__context__)
     assert now == ["own"]
+    assert gc.isenabled()
+
+
+class Pools:
+    """Memory of graphs as torch has it: a pool whose last graph has gone is not given again, nor before 2.13 is one in
+    which a recording has failed."""
+
+    def __init__(self, monkeypatch, fails=()):
+        self.counts, self.stuck, self.fails, self.recorded = {}, set(), fails, 0
+        monkeypatch.setattr("ecslam.kernels.graphs.capture_cuda", self.capture)
+        monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, len(self.counts) + 1))
+
+    def capture(self, function, device, pool):
+        if self.counts.setdefault(pool, None) == 0:
+            raise RuntimeError("use_count > 0 INTERNAL ASSERT FAILED")
+        if pool in self.stuck:
+            raise RuntimeError("beginAllocateToPool: already recording to mempool_id")
+        self.recorded += 1
+        if self.recorded in self.fails:
+            self.stuck.add(pool)
+            raise RuntimeError("operation failed due to a previous error during capture")
+        self.counts[pool] = (self.counts[pool] or 0) + 1
+
+        def replay():
+            outputs[0].copy_(function()[0])
+
+        def gone():
+            self.counts[pool] -= 1
+
+        outputs = function()
+        weakref.finalize(replay, gone)
+        return replay, outputs
+
+
+def doubled(x):
+    return (2 * x,)
+
+
+def test_graphs_are_recorded_again_in_new_memory_once_all_are_forgotten(monkeypatch):
+    pools = Pools(monkeypatch)
+    recorder = Recorder()
+    for time in range(3):
+        for _ in range(3):
+            assert recorder(doubled, torch.ones(1), key=0, device=torch.device("cuda")) == (2,)
+        assert (recorder.failure, pools.recorded) == ("", time + 1)
+        recorder.forget()
+
+
+def test_graphs_are_recorded_again_in_new_memory_once_all_have_had_to_go(monkeypatch):
+    pools = Pools(monkeypatch)
+    recorder = Recorder(keep=1)
+    for time in range(3):
+        for _ in range(3):
+            recorder(doubled, torch.ones(1), key=time, device=torch.device("cuda"))
+        assert (recorder.failure, pools.recorded) == ("", time + 1)
+
+
+def test_graphs_share_memory_as_long_as_one_of_them_is_there(monkeypatch):
+    pools = Pools(monkeypatch)
+    recorder = Recorder()
+    for _ in range(2):
+        for key in (0, 1):
+            recorder(doubled, torch.ones(1), key=key, device=torch.device("cuda"))
+    assert list(pools.counts.values()) == [2]
+
+
+def test_a_recording_that_fails_leaves_others_memory_of_their_own(monkeypatch):
+    pools = Pools(monkeypatch, fails=(2,))
+    recorder, old, new = Recorder(), torch.zeros(1), torch.zeros(1)
+    for state in (old, old, new, new, new):
+        assert recorder(doubled, torch.ones(1), key=0, over=(state,), device=torch.device("cuda")) == (2,)
+    assert (recorder.failure, pools.recorded) == ("", 3)
 
 
 def test_a_mistake_of_the_function_itself_is_not_swallowed():

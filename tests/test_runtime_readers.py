@@ -245,6 +245,9 @@ def test_processes_are_for_recordings_on_a_gpu_and_many_cores(recording, monkeyp
     assert portable(recording, "cpu") is None
     assert portable(open_sequence("synthetic/studio?size=160x120&frames=8"), "cuda") is None
     assert portable(Own(recording), "cuda") is None
+    with monkeypatch.context() as older:
+        older.delattr("os.memfd_create")  # some Pythons lack it
+        assert portable(recording, "cuda") is None
     monkeypatch.setattr(readers, "MOST_BYTES", 100)
     assert portable(recording, "cuda") is None
     monkeypatch.setattr(readers, "cores", lambda: 2)
@@ -283,7 +286,7 @@ def test_memory_is_locked_for_a_gpu_until_nothing_holds_a_frame(locked, monkeypa
 
     monkeypatch.setattr(torch.cuda, "cudart", Runtime)
     monkeypatch.setattr(torch.cuda, "device", lambda index: nullcontext())
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: done.append("wait"))
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: done.append("wait"))
     slots = Slots(CAMERA, RESTING + 1)
     readers.page_lock("cuda:1", slots)
     slot, depth = slots.take(), np.ones((120, 160), np.float32)

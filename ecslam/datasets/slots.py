@@ -48,10 +48,12 @@ class Slots:
         self._last = last
 
     def __del__(self) -> None:
-        if hasattr(self, "_last"):
-            self._last()
-        if hasattr(self, "file"):
-            os.close(self.file)
+        try:
+            if hasattr(self, "_last"):
+                self._last()
+        finally:
+            if hasattr(self, "file"):
+                os.close(self.file)
 
     def take(self) -> int | None:
         """A slot that is free, the one that has been for longest; None where others hold too many frames."""

@@ -7,8 +7,10 @@ host, and must take the same way whatever the values.
 
 from __future__ import annotations
 
+import gc
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
@@ -48,12 +50,25 @@ def capture_cuda(
     """
     with _recording, torch.cuda.device(device), torch.cuda.stream(_lane(device)):
         graph = torch.cuda.CUDAGraph()
-        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-        try:
-            outputs = function()
-        finally:
-            graph.capture_end()
+        with _nothing_collected():
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+            try:
+                outputs = function()
+            finally:
+                graph.capture_end()
     return graph.replay, outputs
+
+
+@contextmanager
+def _nothing_collected() -> Iterator[None]:
+    """Meanwhile no garbage is collected: what frees memory of a device could spoil a recording."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 @cache
@@ -129,7 +144,7 @@ class Recorder:
             held.replay, held.outputs = (self._capture or self._capture_cuda)(lambda: function(*mine), device)
         except RuntimeError as error:
             if held.ran:
-                self.failure = f"no CUDA graph: {error}"
+                self.failure = f"no CUDA graph: {error.__context__ or error}"
                 self._held.clear()
             return False
         held.inputs = mine
@@ -138,5 +153,12 @@ class Recorder:
     def _capture_cuda(
         self, function: Callable[[], Tensors], device: torch.device
     ) -> tuple[Callable[[], None], Tensors]:
+        # torch refuses memory whose last graph has gone, and before 2.13 that in which a recording has failed.
+        if not any(held.replay for held in self._held.values()):
+            self._pool = None
         self._pool = self._pool or torch.cuda.graph_pool_handle()
-        return capture_cuda(function, device, self._pool)
+        try:
+            return capture_cuda(function, device, self._pool)
+        except RuntimeError:
+            self._pool = None
+            raise

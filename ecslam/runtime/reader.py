@@ -50,7 +50,8 @@ class Line:
     those of ``multiprocessing`` it closes its file once, whoever comes first."""
 
     def __init__(self, end: socket.socket) -> None:
-        self._end, self._file = end, end.makefile("rwb")
+        self._end, self._file, self._coming = end, end.makefile("rwb"), select.poll()
+        self._coming.register(end, select.POLLIN)
 
     def send(self, item: object) -> None:
         """Send it."""
@@ -63,7 +64,7 @@ class Line:
 
     def waiting(self) -> bool:
         """Whether something has come."""
-        return bool(select.select([self._end], [], [], 0)[0])
+        return bool(self._coming.poll(0))
 
     def close(self) -> None:
         """Cut it."""

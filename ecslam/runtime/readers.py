@@ -37,7 +37,7 @@ def portable(sequence: Sequence, device: str) -> bytes | None:
     """The sequence, pickled, where processes should read it; None where threads do it as well: without a GPU, on few
     cores, where it cannot be sent or lies in memory, as what is built in, and where its class is not ours, which a
     process may not find."""
-    enough = device.startswith("cuda") and sys.platform == "linux" and cores() >= FEWEST_CORES
+    enough = device.startswith("cuda") and hasattr(os, "memfd_create") and cores() >= FEWEST_CORES
     ours = type(sequence).__module__.startswith(__name__.partition(".")[0])
     if not (enough and ours) or sequence.layout == "synthetic":
         return None
@@ -164,9 +164,11 @@ def page_lock(device: str, slots: Slots) -> None:
 
     def unlock() -> None:
         if not sys.is_finalizing():
-            torch.cuda.synchronize(torch.device(device))
-            runtime.cudaHostUnregister(pointer)
+            with torch.cuda.device(index):
+                torch.cuda.synchronize()
+                runtime.cudaHostUnregister(pointer)
 
-    with torch.cuda.device(torch.device(device).index or 0):
+    index = torch.device(device).index or 0
+    with torch.cuda.device(index):
         if int(runtime.cudaHostRegister(pointer, memory.nbytes, 0)) == 0:
             slots.at_end(unlock)
