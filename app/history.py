@@ -36,9 +36,9 @@ class History:
                 figures["ate_cm"] = s.ate_cm
             self.add(s.reported, figures, s.losses, s.window)
 
-    def names(self, prefix: str = "loss ") -> list[str]:
-        """Names of the series that start with ``prefix``, in the order they first appeared."""
-        return list(dict.fromkeys(name for row in self._rows.values() for name in row if name.startswith(prefix)))
+    def names(self) -> list[str]:
+        """Names of the series of losses, in the order they first appeared."""
+        return list(dict.fromkeys(name for row in self._rows.values() for name in row if name.startswith("loss ")))
 
     def series(self, names: list[str], most: int = 400) -> tuple[NDArray[np.float64], ...]:
         """Frame numbers and one array a name (NaN where missing), at most about ``most`` points."""

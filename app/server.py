@@ -66,7 +66,7 @@ def start(
     if token is not None and (
         len(token) < SHORTEST_TOKEN or not token.isascii() or not token.replace("-", "_").isidentifier()
     ):
-        raise InputError(f"--token: use at least {SHORTEST_TOKEN} letters, digits, '-' or '_', beginning with a letter")
+        raise InputError(f"token: use at least {SHORTEST_TOKEN} letters, digits, '-' or '_', beginning with a letter")
     if token is None and not is_loopback(host):
         token = f"t{secrets.token_urlsafe(24)}"
     listener = listener or bind(host, port)
@@ -87,9 +87,7 @@ def _in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def view(
-    runs: list[Path], host: str = "127.0.0.1", port: int = DEFAULT_PORT, token: str | None = None, dark: bool = False
-) -> Dashboard:
+def view(runs: list[Path], host: str = "127.0.0.1", port: int = DEFAULT_PORT, dark: bool = False) -> Dashboard:
     """Open one finished run, or compare two on the same sequence. Raises InputError."""
     if not 1 <= len(runs) <= 2:
         raise InputError("view takes one run folder, or two to compare")
@@ -105,4 +103,4 @@ def view(
             f"{runs[0]} and {runs[1]}: at the same frames their cameras really were {100 * apart:.1f} cm apart, so "
             "these are not runs on the same recording and cannot be compared"
         )
-    return start(ReplayEngine(loaded[0], tuple(loaded[1:])), host, port, token, dark)
+    return start(ReplayEngine(loaded[0], tuple(loaded[1:])), host, port, dark=dark)

@@ -43,7 +43,7 @@ def take(runs: list[Path], out: Path) -> list[Path]:
 
 def _pictures(
     runs: list[Path],
-) -> list[tuple[str, tuple[int, int], bool, list[Path], Callable[[Any, Dashboard], None]]]:
+) -> list[tuple[str, tuple[int, int], bool, list[Path], Callable[[Any], None]]]:
     first = runs[:1]
     pictures = [
         ("dark", DESKTOP, True, first, _show_plots),
@@ -54,10 +54,10 @@ def _pictures(
 
 
 def _take_one(
-    browser: Any, dashboard: Dashboard, size: tuple[int, int], act: Callable[[Any, Dashboard], None], path: Path
+    browser: Any, dashboard: Dashboard, size: tuple[int, int], act: Callable[[Any], None], path: Path
 ) -> Path:
     page = _opened(browser, dashboard, size)
-    act(page, dashboard)
+    act(page)
     dismiss_toasts(page)
     path.write_bytes(lighter(_still(page)))
     page.close()
@@ -69,7 +69,7 @@ def _film(browser: Any, run: Path, path: Path) -> Path:
     dashboard = view([run], port=0)
     try:
         page, steps = _opened(browser, dashboard, DESKTOP), []
-        _show_plots(page, dashboard)
+        _show_plots(page)
         for frame in np.linspace(0, load_run(run).last, FILM_STEPS).round().astype(int):
             dashboard.engine.submit(RunTo(int(frame)))
             dismiss_toasts(page)
@@ -117,15 +117,15 @@ def lighter(png: bytes) -> bytes:
     return out.getvalue()
 
 
-def _show_nothing(page: Any, dashboard: Dashboard) -> None:
+def _show_nothing(page: Any) -> None:
     """The page as it opens."""
 
 
-def _show_plots(page: Any, dashboard: Dashboard) -> None:
+def _show_plots(page: Any) -> None:
     page.get_by_role("tab", name="Plots").click()
 
 
-def _show_loop(page: Any, dashboard: Dashboard) -> None:
+def _show_loop(page: Any) -> None:
     page.get_by_role("tab", name="Loops").click()
     page.get_by_role("button", name="Next event").click()
 

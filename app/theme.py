@@ -37,11 +37,6 @@ def css(color: RGB) -> str:
     return f"rgb({color[0]},{color[1]},{color[2]})"
 
 
-def paler(color: RGB) -> RGB:
-    """A colour half way to white."""
-    return (color[0] + 255) // 2, (color[1] + 255) // 2, (color[2] + 255) // 2
-
-
 STYLE = """
 [style*="letter-spacing"]{letter-spacing:normal!important}
 .mantine-Tabs-tab{padding:9px 10px;font-size:13px}

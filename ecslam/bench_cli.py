@@ -9,7 +9,7 @@ import typer
 
 from .options import Device, Frames, Json, SequenceArgument, Settings, place
 
-bench = typer.Typer(help="Measure: back ends against each other, speed, accuracy.", no_args_is_help=True)
+bench = typer.Typer(help="Measure: back ends against each other, speed, accuracy, many viewers.", no_args_is_help=True)
 
 
 @bench.command(name="kernels")
@@ -30,8 +30,8 @@ def bench_kernels(
 @bench.command(name="speed")
 def bench_speed(
     sequence: SequenceArgument = "synthetic/studio",
-    presets: Annotated[str, typer.Option(help="Presets to run, separated by commas.")] = "live,lite",
-    frames: Frames = "0:200",
+    presets: Annotated[str, typer.Option(help="Presets or YAML files, separated by commas.")] = "live,lite",
+    frames: Annotated[str, typer.Option(metavar="A:B:STEP", help="Which frames, as a Python slice.")] = "0:200",
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each; medians are printed.")] = 3,
     device: Device = "auto",
     peer: Annotated[bool, typer.Option("--peer", help="Also run Open3D's dense SLAM, if it is installed.")] = False,
@@ -78,7 +78,7 @@ def bench_viewers(
 @bench.command(name="accuracy")
 def bench_accuracy(
     sequence: SequenceArgument = "synthetic/studio",
-    presets: Annotated[str, typer.Option(help="Presets to run, separated by commas.")] = "lite",
+    presets: Annotated[str, typer.Option(help="Presets or YAML files, separated by commas.")] = "lite",
     frames: Frames = "",
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each, with seeds 0, 1, ...")] = 3,
     ablate: Annotated[bool, typer.Option("--ablate", help="Also without FUS, without EBA, without both.")] = False,

@@ -199,6 +199,7 @@ class Config:
     def __post_init__(self) -> None:
         """Raises InputError where settings contradict each other."""
         if self.depth_near_m >= self.depth_far_m:
-            raise InputError("depth_near_m must be smaller than depth_far_m")
+            near, far = f"depth_near_m = {self.depth_near_m:g}", f"depth_far_m = {self.depth_far_m:g}"
+            raise InputError(f"{near} must be smaller than {far}; change one of them")
         if self.align.to == "none" and self.tracking.iterations == 0:
             raise InputError("align.to is none and tracking.iterations is 0, so nothing tracks; change one of them")

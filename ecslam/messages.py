@@ -1,12 +1,12 @@
 """What crosses between the engine and the world: frozen, numpy and built-in types only, picklable.
 
 Out of the engine go a ``Snapshot`` after every frame (newest wins) and ``Event``s (never dropped). Into it go
-``Command``s, drained at frame boundaries and inside long loops.
+``Command``s, which take effect at once or, where they are work, at the next frame.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -323,4 +323,3 @@ class Ack:
     command_id: int
     command: Command
     error: str = ""
-    extra: dict[str, Any] = field(default_factory=dict)

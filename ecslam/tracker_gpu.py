@@ -1,6 +1,6 @@
 """Tracking a frame on a GPU: one upload, one recorded graph, and one wait, when its result is asked for.
 
-The same steps as ``tracker.track_frame`` takes on the host, in fixed sizes: points are spread over the image and
+The same steps as ``tracker.HostTracker`` takes on the host, in fixed sizes: points are spread over the image and
 aligned to the fused volume, then the paper's rendered tracking, where the preset has it, goes on from there.
 """
 

@@ -9,8 +9,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.floating]
-
 
 def words(error: BaseException) -> str:
     """What an error says, or its kind where it says nothing."""

@@ -386,7 +386,7 @@ def test_one_address_is_the_same_from_everywhere(engine, host, count):
 
 @pytest.mark.parametrize("token", ["short", "with space in the middle", "semi;colon;semi;colon", "ünicode-ünicode-ü"])
 def test_weak_tokens_are_refused(engine, token):
-    with pytest.raises(InputError, match="--token"):
+    with pytest.raises(InputError, match="token: use at least"):
         server.start(engine, port=0, token=token)
 
 

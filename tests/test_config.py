@@ -59,7 +59,7 @@ def test_resolved_configuration_reads_back_equal(preset, tmp_path):
         ("align.kernels_m=0.06", "align.kernels_m must be a list of numbers, not the number 0.06"),
         ("align.gradient_range=[0.5]", "align.gradient_range .* takes two numbers"),
         ("align.gradient_range=[1.3, 0.75]", "align.gradient_range .* the lower one first"),
-        ("depth_near_m=9", "--set: depth_near_m must be smaller than depth_far_m"),
+        ("depth_near_m=9", "--set: depth_near_m = 9 must be smaller than depth_far_m = 8; change one of them"),
         ("seed", "key=value"),
         ("preset=full", "choose it with --preset"),
     ],

@@ -22,7 +22,7 @@ from ..runtime.checkpoint import load_checkpoint
 from ..runtime.engine import Engine
 from ..runtime.memory import resident_mb
 from .peer import measure_open3d, open3d_missing
-from .runs import errors, in_own_process, on_frames, preset_config, print_failures, progress, say
+from .runs import Figures, errors, in_own_process, on_frames, preset_config, print_failures, progress, say
 
 SPAN = 200
 SMOOTH = 25
@@ -41,8 +41,6 @@ ROWS = {
     "keyframe_growth_mb": "keyframes stored since (MB)",
     "other_growth_mb": "grown beyond them (MB)",
 }
-
-Figures = dict[str, Any]
 
 
 def bench_speed(

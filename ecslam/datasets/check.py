@@ -16,7 +16,7 @@ from .agreement import odd_truth
 from .prefetch import Prefetch
 from .reading import finite_poses
 from .registry import open_sequence
-from .views import GAP_S, problems
+from .views import problems
 
 USUAL_DEPTH_M = (0.2, 10.0)
 ROOMS_MEDIAN_M = (0.5, 5.0)
@@ -64,9 +64,6 @@ class TimeStats:
 
     duration_s: float
     fps: float
-    gaps: int
-    backwards: int
-    duplicates: int
 
 
 @dataclass(frozen=True)
@@ -228,9 +225,6 @@ def _time_stats(times: NDArray[np.float64]) -> TimeStats:
     return TimeStats(
         duration_s=float(times.max() - times.min()),
         fps=float(1 / np.median(forward)) if len(forward) else 0.0,
-        gaps=int((steps > GAP_S).sum()),
-        backwards=int((steps < 0).sum()),
-        duplicates=int((steps == 0).sum()),
     )
 
 

@@ -254,9 +254,7 @@ def backward(grid, net, s, n, pitch, want_params, want_poses, own, a, b):
 
 
 @njit(**WORKER)
-def table_worker(
-    t, counter, kept, buffers, chunk_rays, grid, padded, total, samples, d_table, table, mean, square, numbers
-):
+def table_worker(t, counter, kept, buffers, chunk_rays, grid, total, samples, d_table, table, mean, square, numbers):
     """Gradient of the whole table from what ``step_worker`` kept, and where there are ``numbers`` for it (see
     ``adam_range``) the table's step: a level belongs to one thread at a time."""
     pitch = up_to_eight(chunk_rays * samples)

@@ -1,4 +1,4 @@
-"""A step of Adam for rigid poses as one Triton kernel: what ``PoseAdam.step`` does with some forty small ones."""
+"""A step of Adam for rigid poses as one Triton kernel: what ``reference.pose_step`` does with some forty small ones."""
 
 from __future__ import annotations
 

@@ -236,7 +236,7 @@ def step(
     if into is not None:
         moments = (adam.mean[0], adam.square[0]) if adam else (into.table, into.table)
         _spread(
-            threads, table_worker, keep, buffers, CHUNK_RAYS, grid, net.padded, count, samples,
+            threads, table_worker, keep, buffers, CHUNK_RAYS, grid, count, samples,
             *(tensor.view(-1).numpy() for tensor in (into.table, params.table, *moments)),
             _adam_numbers(adam) if adam else np.empty(0, np.float32),
         )  # fmt: skip

@@ -200,7 +200,7 @@ class Control:
         """The configuration of the run that ``command`` asks for, on a sequence of ``layout``. Raises InputError."""
         if command.sequence is not None and command.sequence not in self._sequences:
             raise InputError(
-                f"sequence {command.sequence!r} is not on offer; give its folder as a data root at the start"
+                f"sequence {command.sequence!r} is not on offer; name a folder above it with --data at the start"
             )
         if command.preset is not None and command.preset not in self._presets:
             raise InputError(f"preset {command.preset!r} is not on offer; there are: {', '.join(self._presets)}")

@@ -71,11 +71,6 @@ class JobThread:
         """Jobs that are not done yet."""
         return len(self._jobs) + self._busy
 
-    @property
-    def closed(self) -> bool:
-        """Whether jobs at work are asked to end."""
-        return self._closed
-
     def submit(self, job: Callable[[], None]) -> None:
         """Queue a job; the first one starts the thread. Jobs submitted after ``close`` are not done."""
         with self._changed:

@@ -50,7 +50,7 @@ class EngineHandle(Protocol):
         ...
 
     def submit(self, command: Command) -> int:
-        """Queue a command and return its id, which the ``Ack`` will carry. Never blocks; callable from any thread."""
+        """Give a command and return its id, which the ``Ack`` will carry. Never blocks; callable from any thread."""
         ...
 
     def latest(self) -> Snapshot | None:

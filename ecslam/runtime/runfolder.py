@@ -13,6 +13,7 @@ keyframes.jsonl  frame, c2w (12 numbers, when it was made), thumbnail (relative 
 thumbnails/      NNNNNN.jpg, at most 160 pixels wide, by frame
 meshes/          NNNNNN.ply, a few meshes of the growing map, by frame
 mesh.ply         the final mesh
+picture.png      mesh, paths and errors in one picture
 summary.json     the figures
 checkpoints/     see checkpoint.py
 exports/         what was asked for in the dashboard

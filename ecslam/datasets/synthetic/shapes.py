@@ -21,8 +21,8 @@ Vec = tuple[float, float, float]
 class Paint:
     """How a solid looks.
 
-    texture: a name in ``textures.TEXTURES``. tint: linear RGB that multiplies it. repeat_m: metres per repeat of the
-    texture, or 0 to stretch it once over each face. glow: emitted radiance (0 for everything but lamps, screens and
+    texture: a name that ``textures.texture`` takes. tint: linear RGB that multiplies it. repeat_m: metres per repeat of
+    the texture, or 0 to stretch it once over each face. glow: emitted radiance (0 for everything but lamps, screens and
     windows). turn: swap the texture's axes. shift: texture offset in repeats.
     """
 
