@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..types import InputError
 from .mp4 import MOST_FRAMES
-from .reading import read_text, rigid
+from .reading import posed, read_text, rigid
 
 COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 LENS = ("fx", "fy", "cx", "cy")
@@ -45,7 +45,7 @@ def read_odometry(path: Path) -> Odometry:
         raise InputError(f"{path}: no line has a time and a frame number; export it again, or remove the file")
     frames, first = np.unique(usable[:, 1].astype(np.int64), return_index=True)
     usable = usable[first]
-    poses, notes = _poses(usable)
+    poses, notes = rigid(posed(usable[:, 2:5], usable[:, 5:9]))
     if len(usable) < len(rows):
         notes = (f"{len(rows) - len(usable)} lines of {path.name} are damaged or repeated and are left out", *notes)
     return Odometry(frames, usable[:, 0], poses, usable[:, len(COLUMNS) :] if lensed else None, notes)
@@ -57,14 +57,3 @@ def _number(fields: list[str], column: int) -> float:
         return float(fields[column])
     except (ValueError, IndexError):
         return np.nan
-
-
-def _poses(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    from scipy.spatial.transform import Rotation  # half a second to import, which other layouts need not wait for
-
-    good = np.isfinite(rows[:, 2:9]).all(1) & (np.abs(np.linalg.norm(rows[:, 5:9], axis=1) - 1) < 0.1)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[good, :3, :3] = Rotation.from_quat(rows[good, 5:9]).as_matrix()
-    poses[:, :3, 3] = rows[:, 2:5]
-    poses[~good] = np.nan
-    return rigid(poses)

@@ -183,6 +183,20 @@ def finite_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     return cast("NDArray[np.bool_]", np.logical_and.reduce(np.isfinite(poses), axis=(1, 2)))
 
 
+def posed(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses [N, 4, 4] from positions [N, 3] and quaternions x y z w [N, 4], NaN where these are none."""
+    from scipy.spatial.transform import Rotation  # half a second to import, which other layouts need not wait for
+
+    good = np.isfinite(positions).all(1) & np.isfinite(quaternions).all(1)
+    good &= np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 0.1
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    if good.any():
+        poses[good, :3, :3] = Rotation.from_quat(quaternions[good]).as_matrix()
+    poses[:, :3, 3] = positions
+    poses[~good] = np.nan
+    return poses
+
+
 def rigid(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """Poses [N, 4, 4] with NaN for each that is not finite or not a rigid motion, and a note when there are any."""
     safe = np.where(finite_poses(poses)[:, None, None], poses, 0.0)

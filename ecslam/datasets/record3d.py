@@ -24,7 +24,7 @@ from ..indices import evenly
 from ..types import FrameError, InputError, Intrinsics
 from .files import FileSequence
 from .images import HEADER_BYTES, decode_color, parse_header, read_bytes
-from .reading import MAX_PIXELS, MAX_TEXT_BYTES, OPENGL, finite_poses, rigid, same_shape
+from .reading import MAX_PIXELS, MAX_TEXT_BYTES, OPENGL, finite_poses, posed, rigid, same_shape
 from .stray import ARKIT_TRUTH, FINER, LEAST_CONFIDENCE, finer, focus_note
 
 SUFFIXES = (".r3d",)
@@ -211,14 +211,7 @@ def _table(rows: Any, columns: int) -> NDArray[np.float64] | None:
 
 def _matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """[M, 4, 4] of rows qx qy qz qw x y z with OpenGL's axes: OpenCV's axes, NaN where a row is no pose."""
-    from scipy.spatial.transform import Rotation  # half a second to import, which other layouts need not wait for
-
-    good = np.isfinite(rows).all(1) & (np.abs(np.linalg.norm(rows[:, :4], axis=1) - 1) < 0.1)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[good, :3, :3] = Rotation.from_quat(rows[good, :4]).as_matrix() if good.any() else np.empty((0, 3, 3))
-    poses[:, :3, 3] = rows[:, 4:]
-    poses[~good] = np.nan
-    return rigid(poses)[0] @ OPENGL if len(poses) else poses
+    return rigid(posed(rows[:, 4:], rows[:, :4]))[0] @ OPENGL if len(rows) else np.empty((0, 4, 4))
 
 
 def _notes(about: Metadata, alone: int, without: int, unmoved: bool, confident: bool) -> Iterator[str]:
