@@ -16,10 +16,9 @@ def software() -> str:
     clone = Path(__file__).parents[1]
     if not (clone / ".git").exists():
         return __version__
-    try:
-        told = subprocess.run(
-            ["git", "-C", str(clone), "describe", "--always", "--dirty"], capture_output=True, text=True, timeout=5
-        )
+    describe = ["git", "-C", str(clone), "describe", "--always", "--dirty"]
+    try:  # a run that is asked to end waits for this
+        told = subprocess.run(describe, capture_output=True, text=True, timeout=1)
     except (OSError, subprocess.TimeoutExpired):
         return __version__
     return f"{__version__} ({told.stdout.strip()})" if told.returncode == 0 else __version__

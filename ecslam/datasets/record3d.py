@@ -211,7 +211,7 @@ def _table(rows: Any, columns: int) -> NDArray[np.float64] | None:
 
 def _matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """[M, 4, 4] of rows qx qy qz qw x y z with OpenGL's axes: OpenCV's axes, NaN where a row is no pose."""
-    return rigid(posed(rows[:, 4:], rows[:, :4]))[0] @ OPENGL if len(rows) else np.empty((0, 4, 4))
+    return rigid(posed(rows[:, 4:], rows[:, :4]))[0] @ OPENGL
 
 
 def _notes(about: Metadata, alone: int, without: int, unmoved: bool, confident: bool) -> Iterator[str]:

@@ -48,14 +48,13 @@ def capture_cuda(
     Only this thread's calls count as forbidden ones: tracking and mapping may use the device at the same time. Not by
     ``torch.cuda.graph``, which first waits for the device and empties torch's caches; others are using these.
     """
-    with _recording, torch.cuda.device(device), torch.cuda.stream(_lane(device)):
+    with _recording, _nothing_collected(), torch.cuda.device(device), torch.cuda.stream(_lane(device)):
         graph = torch.cuda.CUDAGraph()
-        with _nothing_collected():
-            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-            try:
-                outputs = function()
-            finally:
-                graph.capture_end()
+        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+        try:
+            outputs = function()
+        finally:
+            graph.capture_end()
     return graph.replay, outputs
 
 
@@ -154,9 +153,8 @@ class Recorder:
         self, function: Callable[[], Tensors], device: torch.device
     ) -> tuple[Callable[[], None], Tensors]:
         # torch refuses memory whose last graph has gone, and before 2.13 that in which a recording has failed.
-        if not any(held.replay for held in self._held.values()):
-            self._pool = None
-        self._pool = self._pool or torch.cuda.graph_pool_handle()
+        if self._pool is None or not any(held.replay for held in self._held.values()):
+            self._pool = torch.cuda.graph_pool_handle()
         try:
             return capture_cuda(function, device, self._pool)
         except RuntimeError:
