@@ -66,8 +66,8 @@ class Hub:
         self._asking = threading.Lock()
         self._inbox: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._subscription = engine.subscribe()
-        self._newest: Snapshot | None = None
-        self._newest_lock = threading.Lock()
+        self._woken = False
+        self._shown: Snapshot | None = None
         self._noticed = 0.0
         self._closing = False
         self.panels: list[BasePanel] = []
@@ -90,9 +90,7 @@ class Hub:
                     self.panels += [panel(self) for panel in members]
         hints.tell(self.server.gui)
         self.server.on_client_connect(self._connected)
-        latest = self.engine.latest()
-        if latest is not None:
-            self._take(latest)
+        self._ring()
         if self.replay is not None:
             self.submit(RequestMesh(0.0))
         for thread in self._threads:
@@ -189,14 +187,14 @@ class Hub:
             if self._subscription.overrun:
                 self._subscription = self.engine.subscribe()
             if isinstance(message, Snapshot):
-                self._take(message)
+                self._ring()
             elif message is not None:
                 self.post(partial(self._tell, message))
 
-    def _take(self, s: Snapshot) -> None:
-        with self._newest_lock:
-            fresh, self._newest = self._newest is None, s
-        if fresh:
+    def _ring(self) -> None:
+        """There may be a newer snapshot; only the listener calls this once it runs."""
+        if not self._woken:
+            self._woken = True
             self.post(self._wake)
 
     def _work(self) -> None:
@@ -218,7 +216,7 @@ class Hub:
                 self._attempt(action)
 
     def _wake(self) -> None:
-        """Posted when a snapshot waits; the worker shows it when the page may be refreshed again."""
+        """Posted when a snapshot waits; the worker shows the newest when the page may be refreshed again."""
 
     def _attempt(self, action: Callable[[], None]) -> None:
         try:
@@ -227,10 +225,11 @@ class Hub:
             log.exception("the dashboard could not carry out %r", action)
 
     def _show(self) -> None:
-        with self._newest_lock:
-            s, self._newest = self._newest, None
-        if s is None:
+        self._woken = False  # first, so that no newer one goes unnoticed
+        s = self.engine.latest()
+        if s is None or s is self._shown:
             return
+        self._shown = s
         before = self.current
         restarted = before is not None and s.frame < before.frame and self.replay is None
         if before is None or restarted or before.sequence != s.sequence:

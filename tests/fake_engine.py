@@ -164,8 +164,6 @@ class FakeEngine:
     def _advance(self):
         self._frame = min(self._frame + 1, self.frames - 1)
         i = self._frame
-        if time.monotonic() - self._meshed > MESH_EVERY_S:
-            self._show_mesh(0.04)
         self._state = m.State.MAPPING if i % 5 == 0 else m.State.TRACKING
         if i == int(0.9 * self.frames):
             before = self._estimate(i)[:, :3, 3].astype(np.float32)
@@ -178,6 +176,8 @@ class FakeEngine:
         if self._until is not None and i >= self._until:
             self._state, self._until = m.State.PAUSED, None
         self.publish()
+        if time.monotonic() - self._meshed > MESH_EVERY_S:
+            self._show_mesh(0.04)
 
     def _estimate(self, last: int) -> np.ndarray:
         """Ground truth plus a drift that the loop closure takes away."""
@@ -199,8 +199,8 @@ class FakeEngine:
             path.write_bytes(jpeg(picture(frame)[::2, ::2]))
         return str(path)
 
-    def publish(self):
-        self._feed.publish(self.snapshot())
+    def publish(self, snapshot=None):
+        self._feed.publish(snapshot or self.snapshot())
 
     def snapshot(self) -> m.Snapshot:
         i = max(self._frame, 0)

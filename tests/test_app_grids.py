@@ -44,7 +44,7 @@ def test_a_standing_grid_has_up_and_front_where_they_belong():
 def test_who_looks_straight_at_a_wall_alone_has_a_grid_behind_it(page):
     scene = page.hub.scene
     page.engine.skip_to(3)
-    assert until(lambda: page.hub.current is page.engine.latest())
+    assert until(lambda: page.hub.current is page.engine.latest() and scene.mesh is not None)
     with dial(page) as connection, dial(page) as other:
         enter(connection)
         assert until(lambda: len(list(page.hub.viewers())) == 1)

@@ -22,7 +22,7 @@ from ecslam_app.panels.status import Panel as Status
 from ecslam import config_files
 from ecslam import messages as m
 from ecslam.runtime.engine import Engine
-from tests.fake_engine import FakeEngine, write_run
+from tests.fake_engine import FakeEngine, room_mesh, write_run
 from tests.fake_slam import QUICK, FakeSequence, maker
 from tests.test_app_security import control, dial, enter, hit, press, until, viewing
 
@@ -71,12 +71,12 @@ def test_the_last_window_stays_on_the_page_between_two_mappings(engine, page):
     assert until(lambda: page.hub.current is engine.latest())
     mapped = replace(engine.snapshot(), frame=10, reported=10, window=(0, 5, 10), map_ms=80.0)
     for s in (mapped, replace(mapped, frame=11, reported=11, window=(), map_ms=0.0)):
-        page.hub._take(s)
+        page.engine.publish(s)
         assert until(lambda s=s: page.hub.current is not None and page.hub.current.frame == s.frame)
     assert page.hub.current.window == (0, 5, 10)
     assert page.hub.current.map_ms == 80.0
     assert page.hub.history.series(["map_ms"])[1].tolist()[-1] == 0.0
-    page.hub._take(replace(mapped, frame=0, window=()))
+    page.engine.publish(replace(mapped, frame=0, window=()))
     assert until(lambda: page.hub.current.frame == 0)
     assert page.hub.current.window == (), "a new run has had no mapping yet"
 
@@ -153,6 +153,15 @@ def test_a_new_run_hides_what_the_last_one_drew(engine, page):
     scene.update(s)
     assert scene._camera.visible
     assert scene._frusta.visible
+
+
+def test_a_mesh_that_overtakes_the_first_snapshot_of_its_run_stays(engine, page):
+    with page.hub._subscription._changed:  # the listener has not heard of the snapshot yet
+        engine.publish()
+        page.hub.post(lambda: page.hub._tell(m.MeshReady(0, 0.04, room_mesh())))
+        assert until(lambda: page.hub.scene.mesh is not None)
+    assert until(lambda: page.hub.current is engine.latest())
+    assert page.hub.scene.mesh is not None
 
 
 def test_a_new_run_of_equal_length_brings_its_own_truth_and_camera(engine, page):
@@ -421,7 +430,7 @@ def test_a_run_that_is_over_offers_no_steering_until_a_restart(engine, page, end
     s = replace(engine.skip_to(9).snapshot(), state=m.State.TRACKING)
     assert until(lambda: page.hub.current is engine.latest())
     for shown, wanted in ((s, True), (replace(s, frame=10, state=end), False), (replace(s, frame=0), True)):
-        page.hub._take(shown)
+        page.engine.publish(shown)
         assert until(lambda shown=shown: page.hub.current.state is shown.state)
         assert until(lambda wanted=wanted: usable() == {wanted})
     assert not control(page, "Restart")[1].disabled
@@ -512,7 +521,7 @@ def test_panels_and_scene_show_every_kind_of_snapshot(page, engine, caplog):
     assert until(lambda: page.hub.current is engine.latest())
     for s in odd:
         done = threading.Event()
-        page.hub._take(s)
+        page.engine.publish(s)
         page.hub.post(done.set)
         time.sleep(0.2)
         assert done.wait(2)

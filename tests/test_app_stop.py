@@ -55,14 +55,14 @@ def test_who_confirms_stops_the_run_and_is_not_asked_again(page, viewer):
     press(page, viewer, "Stop?", REALLY)
     assert until(lambda: m.Stop() in page.engine.log)
     assert until(lambda: not asked(page))
-    page.hub._take(replace(page.engine.snapshot(), state=m.State.MAPPING, reason="Last mapping 3/9"))
+    page.engine.publish(replace(page.engine.snapshot(), state=m.State.MAPPING, reason="Last mapping 3/9"))
     assert until(lambda: page.hub.current.state is m.State.MAPPING)
     press(page, viewer, "Run", "Stop")
     assert until(lambda: page.engine.log.count(m.Stop()) == 2), "the last mapping is left out at once"
 
 
 def test_after_the_last_frame_stop_needs_no_question(page, viewer):
-    page.hub._take(replace(page.engine.snapshot(), frame=59, state=m.State.MAPPING))
+    page.engine.publish(replace(page.engine.snapshot(), frame=59, state=m.State.MAPPING))
     assert until(lambda: page.hub.current.frame == 59)
     press(page, viewer, "Run", "Stop")
     assert until(lambda: m.Stop() in page.engine.log)
@@ -70,7 +70,7 @@ def test_after_the_last_frame_stop_needs_no_question(page, viewer):
 
 
 def test_a_camera_has_no_last_frame_so_stop_asks_always(page, viewer):
-    page.hub._take(replace(page.engine.snapshot(), frame=59, live=True))
+    page.engine.publish(replace(page.engine.snapshot(), frame=59, live=True))
     assert until(lambda: page.hub.current.live)
     press(page, viewer, "Run", "Stop")
     assert until(lambda: asked(page))
@@ -81,5 +81,5 @@ def test_a_camera_has_no_last_frame_so_stop_asks_always(page, viewer):
 def test_a_question_about_a_run_that_is_over_goes_away(page, viewer, change):
     press(page, viewer, "Run", "Stop")
     assert until(lambda: asked(page))
-    page.hub._take(replace(page.engine.snapshot(), **change))
+    page.engine.publish(replace(page.engine.snapshot(), **change))
     assert until(lambda: not asked(page))
