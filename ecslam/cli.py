@@ -197,7 +197,9 @@ def mesh(
 
 @app.command()
 def synth(
-    name: Annotated[str, typer.Argument(help="synthetic/studio, synthetic/apartment or synthetic/corridor.")],
+    name: Annotated[
+        str, typer.Argument(help="synthetic/studio, synthetic/apartment, synthetic/corridor or synthetic/gallery.")
+    ],
     folder: Annotated[Path, typer.Argument(help="Folder to write, in the Replica layout.")],
     frames: Frames = "",
 ) -> None:

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from . import config_files, datasets
 from .atomic import write_named
 from .config import Config
+from .datasets.addresses import BUILT_IN
 from .datasets.roots import sequences_under
 from .messages import Notice, Quit, Snapshot
 from .reports import Reports, console, finish_run
@@ -29,7 +30,6 @@ from .runtime.runfolder import CAMERA, read_about
 from .runtime.signals import quit_on_signals
 from .types import InputError, Sequence
 
-BUILT_IN = ("synthetic/studio", "synthetic/apartment", "synthetic/corridor")
 IN_A_TERMINAL = ("www-browser", "links", "elinks", "lynx", "w3m")
 
 

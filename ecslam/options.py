@@ -21,8 +21,8 @@ SequenceArgument = Annotated[
     str,
     typer.Argument(
         help="A folder (7-Scenes, TUM RGB-D, Replica, ScanNet ..., recognised by itself), a file (.bag, .mcap, .db3, "
-        ".sens, .r3d), a built-in room (synthetic/studio, synthetic/apartment, synthetic/corridor) or, to run on, "
-        "a camera that is plugged in: camera/realsense."
+        ".sens, .r3d), a built-in room (synthetic/studio, synthetic/apartment, synthetic/corridor, synthetic/gallery) "
+        "or, to run on, a camera that is plugged in: camera/realsense."
     ),
 ]
 Preset = Annotated[str | None, typer.Option(help="lite, full, live, scannet or tum; default: what suits the layout.")]

@@ -22,6 +22,7 @@ import torch
 from ecslam import __version__, cli, commands, reports
 from ecslam.bench import accuracy, speed
 from ecslam.config_files import apply_settings, load_config, load_preset
+from ecslam.datasets.addresses import ROOMS
 from ecslam.datasets.meshes import load_mesh
 from ecslam.evaluation import plots
 from ecslam.reports import draw_picture
@@ -512,6 +513,12 @@ def test_help_names_every_command():
     text = ecslam("--help").out
     for command in ("run", "demo", "resume", "view", "eval", "mesh", "synth", "check", "bench"):
         assert f" {command} " in text
+
+
+@pytest.mark.parametrize("command", ["run", "synth"])
+def test_help_names_every_room(command):
+    text = re.sub(r"\W+", " ", ecslam(command, "--help").out)
+    assert all(f"synthetic {room}" in text for room in ROOMS)
 
 
 @pytest.mark.parametrize("words", [["run"], ["eval"], ["bench", "speed", "--frames"]])

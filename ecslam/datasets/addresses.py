@@ -9,6 +9,8 @@ from urllib.parse import parse_qsl, quote, urlencode
 from ..types import InputError
 
 SYNTHETIC, CAMERA = "synthetic/", "camera/"
+ROOMS = ("studio", "apartment", "corridor", "gallery")
+BUILT_IN = tuple(SYNTHETIC + room for room in ROOMS)
 READOUT, CALIBRATION, NONE = "readout", "calibration", "none"
 COMMON = (READOUT, CALIBRATION)  # what any recording takes
 

@@ -1,6 +1,7 @@
 """Built-in furnished rooms, rendered on the fly with exact depth, poses and surface."""
 
-from .address import ROOMS, Address, parse_address
+from ..addresses import ROOMS
+from .address import Address, parse_address
 from .export import write_replica
 from .sequence import SyntheticSequence, open_synthetic
 

@@ -6,9 +6,8 @@ import difflib
 from dataclasses import dataclass, replace
 
 from ...types import InputError
-from ..addresses import SYNTHETIC, parse_options
+from ..addresses import BUILT_IN, ROOMS, SYNTHETIC, parse_options
 
-ROOMS = ("studio", "apartment", "corridor")
 MAX_SIDE, MAX_FRAMES = 4096, 100_000
 MOST_READOUT_S, MOST_EXPOSURE = 1 / 30, 0.9
 SWITCH = {"0": False, "1": True}
@@ -42,9 +41,7 @@ def parse_address(address: str, defaults: Address | None = None) -> Address:
     name, _, query = address.removeprefix(SYNTHETIC).partition("?")
     if name not in ROOMS:
         near = difflib.get_close_matches(name, ROOMS, 1, 0.4)
-        hint = (
-            f"did you mean {SYNTHETIC}{near[0]}?" if near else f"choose from {', '.join(SYNTHETIC + r for r in ROOMS)}"
-        )
+        hint = f"did you mean {SYNTHETIC}{near[0]}?" if near else f"choose from {', '.join(BUILT_IN)}"
         raise InputError(f"{SYNTHETIC}{name}: no such built-in room; {hint}")
     out = replace(defaults or Address(name), room=name)
     for key, value in parse_options(query):

@@ -66,7 +66,7 @@ def open_synthetic(
     visitor: bool = False,
     exposure: float = 0.0,
 ) -> SyntheticSequence:
-    """Open a built-in room: ``studio``, ``apartment`` or ``corridor``, also as an address with options (see address).
+    """Open a built-in room, one of ``ROOMS``, also as an address with options (see address).
 
     The camera's path is closed: ``frames`` beyond one round (the default) go round again. ``noise`` imitates a Kinect;
     ``seed`` changes that noise and nothing else; ``readout``, ``visitor``, ``exposure``: see ``Address``. Raises
