@@ -19,17 +19,6 @@ _LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) **
 _SRGB_TO_LINEAR16 = np.round(_LINEAR * 65535).astype(np.uint16)
 
 
-def vertex_normals(mesh: Mesh) -> NDArray[np.float32]:
-    """Area-weighted unit normals [V, 3]; zero where a vertex has no face."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    face = np.cross(b - a, c - a)
-    out = np.zeros(mesh.vertices.shape, np.float64)
-    for corner in range(3):
-        for axis in range(3):
-            out[:, axis] += np.bincount(mesh.faces[:, corner], face[:, axis], len(out))
-    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12), np.float32)
-
-
 def simplify(mesh: Mesh, triangles: int = TRIANGLE_BUDGET) -> Mesh:
     """At most about ``triangles`` triangles by merging vertices in the cells of a grid; unchanged if few enough."""
     count = len(mesh.faces)

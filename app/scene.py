@@ -29,7 +29,7 @@ from .geometry import (
     up_direction,
     wxyz,
 )
-from .glb import simplify, to_glb, vertex_normals
+from .glb import simplify, to_glb
 from .grids import GAP_M, add_grid, paint
 
 MESH_MODES = ("Colour", "Normals", "Wireframe", "Off")
@@ -271,5 +271,5 @@ class Scene:
 
 def _mesh_colors(mesh: Mesh, mode: str) -> NDArray[np.uint8]:
     if mode == "Normals" or mesh.colors is None:
-        return np.round(127.5 + 127.5 * vertex_normals(mesh)).astype(np.uint8)
+        return np.round(127.5 + 127.5 * mesh.vertex_normals()).astype(np.uint8)
     return mesh.colors

@@ -46,7 +46,8 @@ class PixelBank:
         if key not in self._places:
             first, last = self._used, self._used + len(view)
             self._require(last)
-            held, given = self.columns, (view.direction, view.depth, view.color, view.feature)
+            given: tuple[NDArray[Any], ...] = view.direction, view.depth, view.color, view.feature
+            held = self.columns
             columns = (held.direction[:, :2], held.depth, held.color, held.feature)
             for column, new in zip(columns, given, strict=True):
                 column[first:last].copy_(self._ready(new), non_blocking=True)

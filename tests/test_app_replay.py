@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from ecslam_app import server, theme
 from ecslam_app.geometry import best_side, frustum_lines, overview, rotation_difference_deg, rotation_to, up_direction
-from ecslam_app.glb import simplify, to_glb, vertex_normals
+from ecslam_app.glb import simplify, to_glb
 from ecslam_app.history import History, discrepancy, history_of
 from ecslam_app.panels.compare import figures_table
 from ecslam_app.past import Past
@@ -387,12 +387,6 @@ def test_simplified_mesh_keeps_shape_within_budget(triangles):
     assert small.faces.max() < len(small.vertices)
     area = [trimesh.Trimesh(x.vertices, x.faces, process=False).area for x in (mesh, small)]
     assert area[1] == pytest.approx(area[0], rel=0.3)
-
-
-def test_normals_of_a_sphere_point_outwards():
-    ball = trimesh.creation.icosphere(3)
-    mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
-    assert np.allclose(vertex_normals(mesh), ball.vertices, atol=0.02)
 
 
 def test_up_is_found():

@@ -41,6 +41,14 @@ def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
+def test_normals_of_a_sphere_point_outwards() -> None:
+    ball = trimesh.creation.icosphere(3)
+    vertices = np.concatenate([ball.vertices, [[0, 0, 0]]]).astype(np.float32)
+    normals = Mesh(vertices, ball.faces.astype(np.int32)).vertex_normals()
+    assert np.allclose(normals[:-1], ball.vertices, atol=0.02)
+    assert not normals[-1].any(), "a vertex without a face has none"
+
+
 @pytest.mark.parametrize("voxel_m", [0.1, 0.05, 0.02])
 def test_a_sphere_is_closed_oriented_and_where_it_should_be(voxel_m: float) -> None:
     mesh = extract_mesh(sphere_sdf, None, SPHERE, voxel_m)

@@ -127,7 +127,7 @@ def _shade(
     local = np.stack([(column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z, z], -1)
     weights = _barycentric(mesh.vertices[corners].astype(np.float64), local @ c2w[:3, :3].T + c2w[:3, 3])
     colors = np.full((len(mesh.vertices), 3), 0.82) if mesh.colors is None else mesh.colors / 255
-    normal = np.einsum("nk,nkc->nc", weights, _vertex_normals(mesh)[corners])
+    normal = np.einsum("nk,nkc->nc", weights, mesh.vertex_normals()[corners])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     light = 0.62 + 0.20 * (normal @ up) + 0.28 * np.abs(normal @ c2w[:3, 2])
     rgba = np.zeros((*face.shape, 4))
@@ -144,12 +144,3 @@ def _barycentric(corners: Floats, points: Floats) -> Floats:
     v = (np.cross(points - a, c - a) * normal).sum(1) / square
     w = (np.cross(b - a, points - a) * normal).sum(1) / square
     return np.clip(np.stack([1 - v - w, v, w], -1), 0, 1)
-
-
-def _vertex_normals(mesh: Mesh) -> Floats:
-    """Unit normals [V, 3], the mean over the faces around a vertex weighted by area."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    normal = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    around = mesh.faces.reshape(-1)
-    total = np.stack([np.bincount(around, normal[:, k], len(mesh.vertices)) for k in range(3)], -1)
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30))

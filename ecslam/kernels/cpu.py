@@ -92,15 +92,8 @@ def _array(tensor: Tensor) -> NDArray[Any]:
 
 def _grid(layout: GridLayout) -> Grid:
     if layout is not _workspace.layout or _workspace.grid is None:
-        columns = [layout.offset[:, None], layout.size[:, None] - 1, layout.first, layout.dims]
-        geometry = [layout.anchor, layout.blob_low, 1 / layout.blob_size.double(), layout.box[0], layout.box[1]]
-        inverse = 1 / layout.voxel.double()
-        _workspace.grid = Grid(
-            torch.cat(columns, 1).to(torch.int32).contiguous().numpy(),
-            torch.stack([inverse, inverse - inverse.float()], 1).numpy(),
-            torch.cat([part.double() for part in geometry]).numpy(),
-            layout.bins,
-        )
+        levels, inverse, place = layout.packed()
+        _workspace.grid = Grid(levels.numpy(), inverse.numpy(), place.numpy(), layout.bins)
         _workspace.layout = layout
     return _workspace.grid
 

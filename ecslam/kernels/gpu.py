@@ -76,14 +76,8 @@ def _on_device(layout: GridLayout, device: torch.device) -> tuple[Tensor, Tensor
     key = (id(layout), device)
     if key in _layouts:
         return _layouts[key]
-    columns = [layout.offset[:, None], layout.size[:, None] - 1, layout.first, layout.dims]
-    geometry = [layout.anchor, layout.blob_low, 1 / layout.blob_size.double(), layout.box[0], layout.box[1]]
-    inverse = 1 / layout.voxel.double()
-    _layouts[key] = (
-        torch.cat(columns, 1).to(torch.int32).to(device),
-        torch.stack([inverse.float(), (inverse - inverse.float()).float()], 1).to(device),
-        torch.cat([part.double() for part in geometry]).to(device),
-    )
+    levels, inverse, place = layout.packed()
+    _layouts[key] = levels.to(device), inverse.float().to(device), place.to(device)
     weakref.finalize(layout, _layouts.pop, key, None)
     return _layouts[key]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 HIDDEN = 32
@@ -45,6 +46,17 @@ class GridLayout:
     def inputs(self) -> int:
         """Width of the encoding: [hash features (2 per level), one-blob x, y, z]."""
         return FEATURES * self.levels + 3 * self.bins
+
+    def packed(self) -> tuple[Tensor, Tensor, Tensor]:
+        """As compiled kernels read it. int32 [L, 8]: offset, size - 1, first, dims. float64 [L, 2]: 1 / voxel, and what
+        is left of that when it is rounded to float32. float64 [15]: anchor, blob_low, 1 / blob_size, box."""
+        inverse = 1 / self.voxel.double()
+        place = [self.anchor, self.blob_low, 1 / self.blob_size.double(), self.box[0], self.box[1]]
+        return (
+            torch.cat([self.offset[:, None], self.size[:, None] - 1, self.first, self.dims], 1).to(torch.int32),
+            torch.stack([inverse, inverse - inverse.float()], 1),
+            torch.cat([part.double() for part in place]),
+        )
 
 
 @dataclass(frozen=True)

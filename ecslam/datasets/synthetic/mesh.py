@@ -67,7 +67,7 @@ def _triangulate(shape: Shape) -> tuple[Points, Points, NDArray[np.intp]]:
     i, j = np.mgrid[0 : count - 1, 0:across]
     a, b = i * across + j, i * across + (j + 1) % across
     faces = np.concatenate([np.stack([a, b, b + across], -1), np.stack([a, b + across, a + across], -1)]).reshape(-1, 3)
-    return points, _vertex_normals(points, faces), faces
+    return points, Mesh(points.astype(np.float32), faces.astype(np.int32)).vertex_normals(), faces
 
 
 def _box(half: Points) -> tuple[Points, Points, NDArray[np.intp]]:
@@ -158,15 +158,6 @@ def _segments(radius: float, angle: float) -> int:
     chord = 2 * np.arccos(1 - TOLERANCE_M / radius)
     count = int(np.ceil(angle / chord))
     return max(count, 2) if angle < np.pi else max(8, count + count % 2)
-
-
-def _vertex_normals(points: Points, faces: NDArray[np.intp]) -> Points:
-    corner = points[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    out = np.zeros_like(points)
-    for k in range(3):
-        np.add.at(out, faces[:, k], normal)
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-20)
 
 
 @njit(cache=True, nogil=True)
