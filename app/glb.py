@@ -24,8 +24,7 @@ def simplify(mesh: Mesh, triangles: int = TRIANGLE_BUDGET) -> Mesh:
     count = len(mesh.faces)
     if count <= triangles:
         return mesh
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    area = np.linalg.norm(_across(mesh.vertices, mesh.faces), axis=1).sum() / 2
     cell = float(np.sqrt(2 * area / triangles))
     while True:
         out = _cluster(mesh, cell)
@@ -43,10 +42,17 @@ def _cluster(mesh: Mesh, cell: float) -> Mesh:
     def mean(values: NDArray[np.generic]) -> NDArray[np.float64]:
         return np.stack([np.bincount(group, values[:, k], len(counts)) / counts for k in range(3)], 1)
 
-    faces = group[mesh.faces]
+    faces, vertices = group[mesh.faces], mean(mesh.vertices).astype(np.float32)
     kept = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    facing = (_across(mesh.vertices, mesh.faces[kept]) * _across(vertices, faces[kept])).sum(1)
     colors = None if mesh.colors is None else np.round(mean(mesh.colors)).astype(np.uint8)
-    return Mesh(mean(mesh.vertices).astype(np.float32), faces[kept].astype(np.int32), colors)
+    return Mesh(vertices, faces[kept][facing > 0].astype(np.int32), colors)
+
+
+def _across(vertices: NDArray[np.float32], faces: NDArray[np.integer]) -> NDArray[np.float32]:
+    """Normals [F, 3] of faces, twice as long as their areas."""
+    a, b, c = (vertices[corner] for corner in faces.T)
+    return np.asarray(np.cross(b - a, c - a))
 
 
 def to_glb(mesh: Mesh, colors: NDArray[np.uint8], wireframe: bool = False) -> bytes:

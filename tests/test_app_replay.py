@@ -389,6 +389,19 @@ def test_simplified_mesh_keeps_shape_within_budget(triangles):
     assert area[1] == pytest.approx(area[0], rel=0.3)
 
 
+def test_a_rough_floor_that_was_simplified_is_seen_from_above_alone():
+    y, x = (n.ravel() for n in np.mgrid[0:120, 0:120])
+    rng = np.random.default_rng(0)
+    vertices = np.stack([x, y, rng.normal(0, 0.2, x.size)], 1) + rng.uniform(-0.3, 0.3, (x.size, 3)) * (1, 1, 0)
+    low = np.arange(x.size).reshape(120, 120)[:-1, :-1].ravel()
+    faces = np.concatenate([np.stack([low, low + 1, low + 121], 1), np.stack([low, low + 121, low + 120], 1)])
+    small = simplify(Mesh(vertices.astype(np.float32), faces.astype(np.int32)), 5000)
+    a, b, c = (small.vertices[corner] for corner in small.faces.T)
+    upwards = np.cross(b - a, c - a)[:, 2]
+    assert (upwards >= 0).all()
+    assert 0.98 * 119**2 < upwards.sum() / 2 < 1.1 * 119**2, "and it has no holes"
+
+
 def test_up_is_found():
     assert np.allclose(up_direction(walk(50)), [0, 0, 1])
 
