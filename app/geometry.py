@@ -190,9 +190,7 @@ def square_side(mesh: Mesh, up: Array, towards: Array) -> Array:
 
 def _normals(mesh: Mesh) -> Array:
     """Normals [n, 3] of a sample of a mesh's faces, twice as long as each is large."""
-    faces = mesh.faces[:: max(1, len(mesh.faces) // SAMPLE)]
-    a, b, c = (mesh.vertices[faces[:, k]].astype(float) for k in range(3))
-    return np.cross(b - a, c - a)
+    return Mesh(mesh.vertices, mesh.faces[:: max(1, len(mesh.faces) // SAMPLE)]).face_normals()
 
 
 def distance_to_path(point: Array, path: Array) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,16 +25,19 @@ def simplify(mesh: Mesh, triangles: int = TRIANGLE_BUDGET) -> Mesh:
     count = len(mesh.faces)
     if count <= triangles:
         return mesh
-    area = np.linalg.norm(_across(mesh.vertices, mesh.faces), axis=1).sum() / 2
+    normals = mesh.face_normals()
+    area = np.linalg.norm(normals, axis=1).sum() / 2
     cell = float(np.sqrt(2 * area / triangles))
     while True:
-        out = _cluster(mesh, cell)
+        out = _cluster(mesh, normals, cell)
         if len(out.faces) <= triangles:
             return out
         cell *= 1.15
 
 
-def _cluster(mesh: Mesh, cell: float) -> Mesh:
+def _cluster(mesh: Mesh, normals: NDArray[np.float64], cell: float) -> Mesh:
+    """The mesh with one vertex in each cell of a grid, without the faces that collapse or turn away from ``normals``,
+    which they had before."""
     key = np.floor((mesh.vertices - mesh.vertices.min(0)) / cell).astype(np.int64)
     size = key.max(0) + 1
     flat = (key[:, 0] * size[1] + key[:, 1]) * size[2] + key[:, 2]
@@ -42,17 +46,12 @@ def _cluster(mesh: Mesh, cell: float) -> Mesh:
     def mean(values: NDArray[np.generic]) -> NDArray[np.float64]:
         return np.stack([np.bincount(group, values[:, k], len(counts)) / counts for k in range(3)], 1)
 
-    faces, vertices = group[mesh.faces], mean(mesh.vertices).astype(np.float32)
+    faces = group[mesh.faces]
     kept = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    facing = (_across(mesh.vertices, mesh.faces[kept]) * _across(vertices, faces[kept])).sum(1)
     colors = None if mesh.colors is None else np.round(mean(mesh.colors)).astype(np.uint8)
-    return Mesh(vertices, faces[kept][facing > 0].astype(np.int32), colors)
-
-
-def _across(vertices: NDArray[np.float32], faces: NDArray[np.integer]) -> NDArray[np.float32]:
-    """Normals [F, 3] of faces, twice as long as their areas."""
-    a, b, c = (vertices[corner] for corner in faces.T)
-    return np.asarray(np.cross(b - a, c - a))
+    out = Mesh(mean(mesh.vertices).astype(np.float32), faces[kept].astype(np.int32), colors)
+    turned = (normals[kept] * out.face_normals()).sum(1) <= 0
+    return replace(out, faces=out.faces[~turned])
 
 
 def to_glb(mesh: Mesh, colors: NDArray[np.uint8], wireframe: bool = False) -> bytes:

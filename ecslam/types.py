@@ -127,10 +127,14 @@ class Mesh:
     faces: NDArray[np.int32]
     colors: NDArray[np.uint8] | None = None
 
+    def face_normals(self) -> NDArray[np.float64]:
+        """Normals [F, 3] of the faces, each twice as long as its face is large."""
+        a, b, c = (self.vertices[corner].astype(np.float64) for corner in self.faces.T)
+        return np.cross(b - a, c - a)
+
     def vertex_normals(self) -> NDArray[np.float64]:
         """Unit normals [V, 3], the mean over the faces around a vertex weighted by area; zero where it has none."""
-        a, b, c = (self.vertices[corner].astype(np.float64) for corner in self.faces.T)
-        face, total = np.cross(b - a, c - a), np.zeros((len(self.vertices), 3))
+        face, total = self.face_normals(), np.zeros((len(self.vertices), 3))
         for corner in self.faces.T:
             for axis in range(3):
                 total[:, axis] += np.bincount(corner, face[:, axis], len(total))
