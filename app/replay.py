@@ -131,7 +131,7 @@ class ReplayEngine:
         elif isinstance(command, Export):
             self._feed.publish(Exported(command.kind, str(export(self.run, command)), number))
         elif not isinstance(command, RequestPictures):
-            raise InputError(f"{type(command).__name__}: a finished run cannot do that; start one with `ecslam run`")
+            raise InputError("a finished run is looked at and exported, not steered; start one with `ecslam run`")
 
     def _show_mesh(self) -> None:
         """Publish the mesh of the frame on show, if it is not the one that was published last."""
