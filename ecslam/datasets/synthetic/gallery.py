@@ -19,8 +19,9 @@ FRAMES = 1600
 WEST, EAST, SOUTH, NORTH = WIDTH, LENGTH - WIDTH, WIDTH, DEPTH - WIDTH  # the block's walls
 CORNERS = ((1.0, 1.0), (LENGTH - 1.0, 1.0), (LENGTH - 1.0, DEPTH - 1.0), (1.0, DEPTH - 1.0))
 LAMPS = tuple((x, y) for x in (1.0, 3.3, 5.5, 7.8) for y in (1.0, 3.7, 6.4) if y != 3.7 or x in (1.0, 7.8))
+# share of a passage, yaw off its direction and pitch in degrees
 GLANCES = ((0.06, 22, -9), (0.24, -14, -12), (0.42, 16, -8), (0.6, -18, -12), (0.78, 8, -9), (0.94, 48, -10))
-FIRST = 3
+FIRST = 3  # the glance that the walk begins with
 
 
 def build() -> Room:
