@@ -55,8 +55,9 @@ def reading(recording, config=lambda: LIVE, count=2):
 
 def wait_until_up(processes, count=2):
     deadline = time.monotonic() + PATIENCE_S
-    while sum(helper.ready() for helper in processes._helpers) < count:
-        processes.submit(0).result()
+    while sum(helper._greeted == 2 and not helper._gone for helper in processes._helpers) < count:
+        for asked in [processes.submit(0) for _ in range(2 * count)]:  # each helper is asked by its own thread alone
+            asked.result()
         assert time.monotonic() < deadline, "no process came up"
         time.sleep(0.02)
 
